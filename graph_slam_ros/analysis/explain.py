@@ -60,21 +60,20 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
 
     Raises FormatError: the summary of the run is invalid.
     """
-    entries, found = run.entries, outcome.findings(summary_of(run.folder))
-    for text in (*found[0], *found[1]):
-        yield from _line("found", text)
+    entries, summary = run.entries, summary_of(run.folder)
+    for one in outcome.findings(summary):
+        yield from _line("found", str(one))
     judged = [entry for entry in entries if entry.verdict]
-    kinds = f"{len(judged)} are measurements that can be rejected, the others are odometry and priors"
-    yield f"{len(entries)} edges; {kinds}"
+    yield f"{len(entries)} edges; {len(judged)} are measurements that can be rejected, the others odometry and priors"
     if judged:
         yield from _table(judged)
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
     yield from condensed_lines(run)
-    yield from _gates(judged, run.changes, run.config)
+    yield from (f"warning: {text}" for text in inert_gates(run))
     yield from (f"by hand: {one.text}" for one in run.edits)
-    yield from _rivals(run.folder)
-    yield from (one["text"] for one in summary_of(run.folder).get("displacements", ()) if "text" in one)
+    yield from _rivals(run.folder, summary)
+    yield from (one["text"] for one in summary.get("displacements", ()) if "text" in one)
 
 
 def _table(entries: Sequence[Entry]) -> Iterator[str]:
@@ -106,14 +105,15 @@ def _row(e: Entry, numbers: str) -> str:
     return f"  edge {e.edge:<7d} {e.about:24s} keyframe {e.keyframe:<6d} {numbers}   {_state(e.verdict, e.reason)}"
 
 
-def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: Config) -> Iterator[str]:
-    """Warn of gates that reject nothing: every statistic is far below them, more than correct noise explains."""
-    if not config.robust.decide:
-        yield "warning: robust.decide is false: no measurement is ever held back or rejected"
+def inert_gates(run: SavedGraph) -> Iterator[str]:
+    """Yield gates that reject nothing: every statistic is far below them, more than correct noise explains."""
+    if not run.config.robust.decide:
+        yield "robust.decide is false: no measurement is ever held back or rejected"
         return
-    gate = {e.edge: quantile(config.robust.gate, e.dof) for e in entries}
+    entries = [e for e in run.entries if e.verdict]
+    gate = {e.edge: quantile(run.config.robust.gate, e.dof) for e in entries}
     seen = {e.edge: e.statistic for e in entries}
-    for change in changes:
+    for change in run.changes:
         if change.edge in seen:
             seen[change.edge] = max(seen[change.edge], change.statistic)
     for label in dict.fromkeys(e.label for e in entries):
@@ -122,15 +122,15 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
         below = gammainc([0.5 * e.dof for e in of_label], [0.5 * largest * gate[e.edge] for e in of_label])
         if largest < _FAR and below.prod() < _CHANCE:
             yield (
-                f"warning: the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
+                f"the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
                 f" {largest:.2g} of it; the stated noise is too large, and false measurements may pass"
             )
 
 
-def _rivals(folder: Path) -> Iterator[str]:
+def _rivals(folder: Path, summary: Mapping[str, Any]) -> Iterator[str]:
     """The hypotheses that the last search could not rule out."""
     try:
-        rows = [_rival(folder, rival) for rival in summary_of(folder).get("rivals", ())]
+        rows = [_rival(folder, rival) for rival in summary.get("rivals", ())]
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise FormatError(f"{folder / SUMMARY}: not the summary of a run: {error!r}") from None
     yield from rows

@@ -90,8 +90,8 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
         else:
             several, frame = drive.later()
         found = Consistency(*several, noise, _left_out(*several, known, len(landmarks)), frame=frame)
-    is_void = outcome.findings(summary_of(run))[0]  # such a run says nothing of odometry's noise
-    config_of = None if is_void else config
+    is_void = any(one.severity == "error" for one in outcome.findings(summary_of(run)))
+    config_of = None if is_void else config  # such a run says nothing of odometry's noise
     advice = noise_advice(noise, is_applied=is_applied, config=config_of, over_confident=found.over_confidence)
     return replace(found, advice=advice)
 

@@ -7,13 +7,13 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import check_contradictions
-from graph_slam_ros.check.finding import FOLLOWS, Finding, Severity, in_order
 from graph_slam_ros.check.fixes import check_fixes
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.odometry import check_odometry, check_publishers, of_one_publisher
 from graph_slam_ros.check.times import check_times, rounded_s
-from graph_slam_ros.measurements.reasons import Effect, explain, remedy
+from graph_slam_ros.findings.finding import Finding, Severity, in_order
+from graph_slam_ros.findings.table import Effect, explain
 
 _MOST = 0.5
 _USUAL = {  # of single messages: detectors err, and a recording begins and ends somewhere
@@ -46,11 +46,10 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
             share = times / received
             limit = _USUAL_SHARE if reason in _USUAL else 0.0
             severity: Severity = "error" if share > _MOST and is_lost else "warning" if share > limit else "note"
-            what = f"{source}: {times} of {received}{' are refused' * is_lost}: {row.meaning}"
-            text = "; ".join(filter(None, (what, remedy(source, reason))))
+            text = f"{source}: {times} of {received}{' are refused' * is_lost}: {row.meaning}"
             settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and source in items else ()
             name, first_ns = (source, 0) if topic is None else (topic.topic, int(next(iter(topic.stamp_ns), 0)))
-            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times, settings)
+            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times, settings, source)
 
 
 def check_unnamed(c: Columns) -> Iterator[Finding]:
@@ -101,7 +100,7 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     with np.errstate(all="ignore"):
         whole, c = c, of_one_publisher(c)
         found += check_publishers(whole) if whole is not c else []
-        told = FOLLOWS["two_publishers"] if found else ()
+        told = explain("two_publishers").hides if found else ()
         if codes := {one.code for one in refused_odometry(c)}.difference(told):  # all follows, and this may from units
             found += [one for one in check_odometry(c) if one.code == "units" and codes == {"other_publisher"}]
             checks = tuple(check for check in checks if check is check_refusals and not found)
@@ -119,7 +118,7 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
 def with_inputs(c: Columns, found: Iterable[Finding]) -> list[Finding]:
     """Findings with the name of the input that their topic is of."""
     inputs = {name: topic.inputs[0] for name, topic in c.topics.items() if topic.inputs}
-    return [replace(one, source=inputs.get(one.topic, "")) for one in found]
+    return [replace(one, source=one.source or inputs.get(one.topic, "")) for one in found]
 
 
 def refused_odometry(c: Columns) -> list[Finding]:
@@ -129,7 +128,7 @@ def refused_odometry(c: Columns) -> list[Finding]:
 
 def worst_of_replay(c: Columns, *, is_damaged: bool = False) -> Finding | None:
     """The worst error or warning beyond what the end of a replay says anyway; None where there is none."""
-    known = (*_IN_OUTCOME, *(FOLLOWS["damaged"] if is_damaged else ()))
+    known = (*_IN_OUTCOME, *(explain("damaged").hides if is_damaged else ()))
     return next((f for f in check_columns(c, OF_A_REPLAY) if f.severity != "note" and f.code not in known), None)
 
 

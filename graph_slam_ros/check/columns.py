@@ -6,14 +6,14 @@ A ``Collector`` gets each decoded message, and the measurements that the convert
 
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from graph_slam_ros.check.finding import TopicData
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import ASSUMED, InputConfig
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import AngularVelocity, Control, Fix, Measured, Odometry, Sighting, Sightings
@@ -29,6 +29,39 @@ _TWIST = (0, 7, 14, 21, 28, 35)  # places in a covariance
 _UNKNOWN_M = 30.0  # so large is the sigma of an axis that a detector does not know
 _OF_ODOMETRY, _OF_GYRO, _OF_FIX, _OF_SIGHTING = 19, 7, 4, 6  # numbers of each
 Decoder = Callable[[bytes], Any]
+SomeTopicData = TypeVar("SomeTopicData", bound="TopicData")
+
+
+class TopicData:
+    """Arrays with a row for each message or measurement of a topic; makes the findings on them."""
+
+    __slots__ = ()
+    topic: str
+    stamp_ns: Index
+
+    def some(self: SomeTopicData, which: Index | Mask) -> SomeTopicData:
+        """The same of some of them."""
+        rows = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
+        arrays = {name: row[which] for name, row in rows.items() if isinstance(row, np.ndarray)}
+        return replace(self, **arrays)  # type: ignore[type-var]
+
+    def finding(
+        self,
+        code: str,
+        severity: Severity,
+        value: float,
+        limit: float,
+        unit: str,
+        text: str,
+        count: int | None = None,
+        at: Index | None = None,
+        settings: tuple[str, ...] = (),
+    ) -> Finding:
+        """A finding of the topic, or of so many of its messages, or those at some stamps."""
+        stamps_ns = self.stamp_ns if at is None else at
+        first_ns, number = int(next(iter(stamps_ns), 0)), len(stamps_ns) if count is None else int(count)
+        whole = f"{self.topic or 'odometry'}: {text}"
+        return Finding(code, severity, value, limit, unit, whole, self.topic, first_ns, number, settings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

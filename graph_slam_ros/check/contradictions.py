@@ -7,7 +7,6 @@ from operator import itemgetter
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import NO_IDS, Finding, Severity
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
 from graph_slam_ros.check.odometry import fitted, twist_factor
 from graph_slam_ros.check.pairs import (
@@ -21,6 +20,8 @@ from graph_slam_ros.check.pairs import (
     noisier,
     pairs_of,
 )
+from graph_slam_ros.findings.finding import Finding, Severity
+from graph_slam_ros.findings.table import NO_IDS
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask

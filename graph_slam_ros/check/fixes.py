@@ -7,10 +7,10 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, FixColumns
 from graph_slam_ros.check.contradictions import factor_setting, turned_mount
-from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.odometry import TOGETHER, worst_stretch
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.typing import Array, Index
 

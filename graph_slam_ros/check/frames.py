@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.config.inputs import ASSUMED
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, assumed_mount
 from graph_slam_ros.overview.contents import root_of

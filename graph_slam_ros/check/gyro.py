@@ -8,10 +8,10 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.contradictions import turned_mount
-from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.odometry import fitted
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Numbers

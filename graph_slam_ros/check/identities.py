@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.check.columns import SightingColumns
-from graph_slam_ros.check.finding import Finding, Severity
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST, _IN_EACH, _PART = 12, 5, 0.05

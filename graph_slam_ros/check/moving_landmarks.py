@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.check.pairs import Pairs, noise_of, pairs_of, poses_at
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
 

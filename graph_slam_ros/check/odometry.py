@@ -7,10 +7,10 @@ from typing import TypeAlias
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
-from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.config.pipeline import OdometryConfig
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Mask
 

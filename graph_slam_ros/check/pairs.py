@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns, TopicColumns
-from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.config.node import TimeConfig
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.typing import Array, Index, Mask

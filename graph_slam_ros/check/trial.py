@@ -5,12 +5,12 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.identities import at_two_places, check_moved, check_outliers, check_reused
 from graph_slam_ros.check.odometry import TOGETHER, twist_factor, worst_stretch
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import END, Measurement, Odometry

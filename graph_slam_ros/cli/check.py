@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
 from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS

@@ -36,7 +36,7 @@ def evaluate(args: argparse.Namespace) -> int:
     scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
     console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
-    found = [one for some in findings(summary_of(args.run_folder)) for one in some][:1]
+    found = [str(one) for one in findings(summary_of(args.run_folder))[:1]]
     lost = console.report_losses(scores.losses, [*found, *scores.warnings, *changed_since(args.run_folder)])
     if not args.json:
         same = [*(("--topic", args.topic) if args.topic else ()), *(("--no-align",) if args.no_align else ())]

@@ -5,11 +5,13 @@ DEGRADED if the estimate goes on but is worse than it could be, or ERROR if some
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.measurements.reasons import explain, remedy
+from graph_slam_ros.findings.finding import Finding, causes
+from graph_slam_ros.findings.table import DOUBTS, explain, remedy
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
@@ -126,7 +128,7 @@ class Facts:
     failing : why the last solve failed; empty where it did not
     authorities : other nodes that publish /tf, one of which broadcasts map -> odom, if somebody does
     static_authority : the transform to odometry's frame that one of these publishes on /tf_static, if one does
-    findings : what is wrong with the inputs by a check that needs no fit, each with what mends it
+    findings : what is wrong with the inputs by a check that needs no fit
     outcome : what became of what was asked for last on a topic; None where nothing was
     tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
@@ -157,7 +159,7 @@ class Facts:
     authorities: tuple[str, ...] = ()
     static_authority: str = ""
     twins: int = 0
-    findings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     outcome: Outcome | None = None
     tf_behind_s: float = 0.0
     preparing: str = ""
@@ -234,7 +236,7 @@ def _missing(facts: Facts) -> Iterator[str]:
         yield "no input"
 
 
-def _silence(one: InputFacts, findings: tuple[str, ...]) -> Iterator[str]:
+def _silence(one: InputFacts, findings: Sequence[Finding]) -> Iterator[str]:
     if one.mismatch:
         yield f"{one.topic}: {one.mismatch}"
     elif one.unpublished:
@@ -246,7 +248,7 @@ def _silence(one: InputFacts, findings: tuple[str, ...]) -> Iterator[str]:
     elif one.not_found:
         yield f"{one.topic}: {one.not_found}"
     elif findings:
-        yield from findings
+        yield from map(_said, findings)
     else:
         yield f"{one.topic}: its first messages wait for their turn"
 
@@ -315,7 +317,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
     elif estimate and not estimate.is_confirmed:
         yield "where the robot is in the loaded map is not known yet: drive past known landmarks, or give initialpose"
     if estimate:
-        yield from map(_without_option, _of_measurements(facts, estimate, health.chi2_per_dof))
+        yield from map(_said, causes(_of_measurements(facts, estimate, health.chi2_per_dof)))
 
 
 def _lateness(one: InputFacts, most_s: float) -> Iterator[str]:
@@ -338,22 +340,20 @@ def _later_than_odometry(one: InputFacts, facts: Facts, most_s: float) -> Iterat
         )
 
 
-def _of_measurements(facts: Facts, e: Estimate, chi2_per_dof: float) -> Iterator[str]:
-    """Yield what is wrong with what is measured. A wrong or mostly refused input explains what else is wrong."""
-    counted = ((one.name, one.counts, one.received) for one in facts.inputs if one.use in MOTION)
-    wrong = [*facts.findings, *filter(None, (leaves_plane(*of) for of in counted))]
-    yield from wrong
-    is_explained = wrong or any(2 * one.recent.times > one.recent.came for one in facts.inputs)
-    if not is_explained:
-        yield from filter(None, (e.displaced, e.association, e.uncorrected, "" if e.displaced else e.doubted))
-    yield from filter(None, (e.visits, e.motion, e.ambiguity))
-    if not is_explained and chi2_per_dof and e.fit > chi2_per_dof:
-        yield f"the measurements contradict each other: chi2 per degree of freedom is {e.fit:.1f}"
+def _of_measurements(facts: Facts, e: Estimate, chi2_per_dof: float) -> Iterator[Finding]:
+    """Yield what is wrong with what is measured; nothing that may follow from an input that is mostly refused."""
+    planes = [leaves_plane(one.name, one.counts, one.received) for one in facts.inputs if one.use in MOTION]
+    found = [*facts.findings, *chain(*planes), *e.findings, *e.doubted]
+    if chi2_per_dof and e.fit > chi2_per_dof:
+        text = f"the measurements contradict each other: chi2 per degree of freedom is {e.fit:.1f}"
+        found.append(Finding("contradictory", "error", text=text, remedy=""))
+    is_explained = any(2 * one.recent.times > one.recent.came for one in facts.inputs)
+    yield from (one for one in found if not (is_explained and one.code in (*DOUBTS, "confused")))
 
 
-def _without_option(text: str) -> str:
-    """Remove the option of the commands before parameters, which a node does not have."""
-    return text.replace("--set ", "")
+def _said(found: Finding) -> str:
+    """A finding without the option of the commands before parameters, which a node does not have."""
+    return str(found).replace("--set ", "")
 
 
 def _uncorrected(facts: Facts) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,24 +11,15 @@ from typing import Any
 import numpy as np
 from mcap.records import Message
 
+from graph_slam_ros.findings.finding import Finding
+from graph_slam_ros.findings.table import explain
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.measurements.types import Odometry, check_space, from_record
 from graph_slam_ros.recordings.mcap_records import records
 from graph_slam_ros.runs.journal import CORRECTION, parts_of
-from graph_slam_ros.runs.outcome import (
-    VISITS,
-    ambiguities,
-    association_faults,
-    condensed_text,
-    contradicts,
-    renewed_text,
-    visit_faults,
-    wrong_sides,
-)
+from graph_slam_ros.runs.outcome import VISITS, condensed_text, contradicted, of_map
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
 from graph_slam_ros.slam import Config, GraphSlam, MapView
-from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers
@@ -112,15 +103,9 @@ class Estimate:
     unseen : the way since a landmark was seen
     weakest_landmark : the landmark that is known least, with its weakest direction; empty where none is known
     fit : chi2 per degree of freedom; NaN before it was looked at
-    doubted : inputs of which most measurements are not believed lately, and why that may be, and ids that are all new
-        from some time on; empty where nothing is doubted
-    ambiguity : other explanations of the same measurements that could not be ruled out; empty where there is none
-    displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
-    association : why the association of sightings without identity is not to be believed; empty if it is
+    doubted : inputs of which most measurements are not believed lately, and ids that are all new from some time on
+    findings : what else is wrong with the map and its motion
     condensed : which keyframes were condensed, or why none was in a long drive; empty in a short one
-    visits : why a condensed map is worse, or larger, than it should be; empty if it is not
-    uncorrected : clocks, mounts and scales that are off and not corrected; empty where none is
-    motion : why the gyro, or an odometry, has no part in the motion; empty where all have
     gyro : its state and its bias; empty where no input is one
     calibration : settings of odometry's factors that the association found, and what is off without being corrected
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
@@ -143,15 +128,10 @@ class Estimate:
     slowest_solve_s: float
     fit: float
     unseen: UnseenWay
-    doubted: str = ""
+    doubted: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     weakest_landmark: str = ""
-    displaced: str = ""
-    association: str = ""
     condensed: str = ""
-    visits: str = ""
-    uncorrected: str = ""
-    motion: str = ""
-    ambiguity: str = ""
     gyro: str = ""
     is_resumed: bool = False
     is_lost: bool = False
@@ -188,38 +168,40 @@ def estimate_of(slam: GraphSlam, **known: Any) -> Estimate:
         edges=view.graph.edge_count,
         segments=len(view.segments),
         solves=view.solves,
-        displaced=str(view.displaced or ""),
-        association="; ".join(association_faults(view.association_report)),
+        findings=tuple(_found(slam)),
         condensed=condensed_text(condensed_part(view)),
-        visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
-        uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in view.uncorrected_so_far),
-        motion="; ".join(filter(None, (_frozen(view), view.gyro.fault if view.gyro else ""))),
-        ambiguity=_ambiguity(view),
         gyro=str(view.gyro or ""),
         calibration=_calibration(view.found_settings, view.contradicted),
         **known,
     )
 
 
-def _frozen(view: MapView) -> str:
-    name = view.odometry_source
-    return f"{name}: {explain('frozen').meaning}: {remedy(name, 'frozen')}" if view.odometry_is_frozen else ""
+def _found(slam: GraphSlam) -> Iterator[Finding]:
+    """Yield that the robot is elsewhere, what the end of a run would say, too, and that odometry stands."""
+    view = slam.view
+    if view.displaced:
+        yield Finding("elsewhere", "error", text=str(view.displaced), follows=("contradicted", "ids_renewed"))
+    yield from of_map(
+        {
+            "uncorrected": [one.as_dict() for one in view.uncorrected_so_far],
+            "gyro": view.gyro and asdict(view.gyro),
+            "association": view.association_report,
+            "rivals": [asdict(one) for one in view.backend.rivals],
+            "landmarks": len(view.landmarks),
+            "waiting": view.waiting,
+            "counters": {"map": {name: slam.counters["map", name] for name in VISITS}},
+        }
+    )
+    if view.odometry_is_frozen:
+        name = view.odometry_source
+        yield Finding("frozen", "error", text=f"{name}: {explain('frozen').meaning}", source=name)
 
 
-def _ambiguity(view: MapView) -> str:
-    rivals = ambiguities([asdict(one) for one in view.backend.rivals])
-    return "; ".join(filter(None, (*rivals, wrong_sides(len(view.landmarks), view.waiting))))
-
-
-def doubted_lately(view: MapView) -> str:
-    """Say of which inputs most measurements are not believed lately, and of ids that are new; empty where of none."""
+def doubted_lately(view: MapView) -> tuple[Finding, ...]:
+    """Return of which inputs most measurements are not believed lately, and that ids are new."""
     lately = ((name, *of) for name, of in accepted_lately(view).items() if of[1] >= _FEWEST_JUDGED)
-    renewed = [renewed_text(str(one))] if (one := view.renewed_ids()) else []
-    return "; ".join(filter(None, (*(contradicts(*of) for of in lately), *renewed)))
-
-
-def _settings(one: Finding) -> list[str]:
-    return [f"{key}={value}" for key, value in one.as_dict()["settings"].items()]
+    found = (one for of in lately for one in contradicted(*of))
+    return (*(one for one in found if one.severity == "error"), *of_map({"renewed_ids": view.renewed_ids()}))
 
 
 def _calibration(found: Mapping[str, float], contradicted: Sequence[str]) -> dict[str, str]:

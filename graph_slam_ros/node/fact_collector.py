@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from graph_slam_ros.errors import message_of
-from graph_slam_ros.measurements.reasons import Effect, explain
+from graph_slam_ros.findings.table import Effect, explain
 from graph_slam_ros.node.diagnostics import WINDOW_S, Facts, Recent
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Preparation

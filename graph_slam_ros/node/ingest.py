@@ -12,7 +12,7 @@ from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
-from graph_slam_ros.measurements.reasons import explain, remedy
+from graph_slam_ros.findings.table import explain, remedy
 from graph_slam_ros.measurements.types import InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.messages.from_msg import INITIAL_POSE, Decoder, MessageConverter, twist_of

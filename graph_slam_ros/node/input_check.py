@@ -5,11 +5,13 @@ It is that of a replay (``check.checks.worst_while_driving``), again and again, 
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 from graph_slam_ros.check.checks import worst_while_driving
 from graph_slam_ros.check.columns import Collector, Columns
-from graph_slam_ros.check.finding import Finding
+from graph_slam_ros.findings.finding import Finding
+from graph_slam_ros.findings.table import DOUBTS
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Decoder, OwnDecoder
@@ -34,7 +36,7 @@ class InputCheck:
 
     Attributes
     ----------
-    findings : what is wrong with an input, and what mends it; empty where nothing is known to be wrong
+    findings : what is wrong with an input; empty where nothing is known to be wrong
     """
 
     def __init__(self, config: Config, topics: Mapping[str, str], counters: Counters) -> None:
@@ -49,7 +51,7 @@ class InputCheck:
         self._messages = 0  # since the last check
         self._kept, self._left_out = 0, 0  # messages of odometry in this collection, and between them
         self._due_s, self._goes_on = 0.0, False
-        self.findings: tuple[str, ...] = ()
+        self.findings: tuple[Finding, ...] = ()
 
     def decoders(self, installed: Mapping[str, Decoder]) -> dict[str, Decoder]:
         """Return these decoders, and those of landmarks and odometry, whose messages are collected, too."""
@@ -114,7 +116,7 @@ class InputCheck:
         try:
             found = [one for one in worst_while_driving(columns) if one.code != "slow_odometry" or not is_thinned]
             if sure := [one for one in found if one.count >= _FEW.get(one.code, _LEAST)]:
-                self.findings = tuple(map(_text, sure))
+                self.findings = tuple(map(_as_cause, sure))
             elif found:
                 self._due_s = time.monotonic() + _SOON_S
             elif is_full:
@@ -124,5 +126,6 @@ class InputCheck:
             self._goes_on = False
 
 
-def _text(found: Finding) -> str:
-    return f"{found.code}: {found.text}: {' '.join(found.settings) or found.mend}"
+def _as_cause(found: Finding) -> Finding:
+    """A finding of which all that may follow is not said."""
+    return replace(found, severity="error", text=f"{found.code}: {found.text}", follows=(*DOUBTS, "confused"))

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError, similar_file
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.measurements.types import END, InitialPose
 from graph_slam_ros.node.estimate import Estimate, Resumption, UnseenWay, WeakestLandmark, doubted_lately, estimate_of
 from graph_slam_ros.node.worker import run_in_thread
@@ -94,7 +95,7 @@ class Session:
         self._resumption = None
         self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.view.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
-        self._fit, self._fitted_at, self._fit_due_s, self._doubted = float("nan"), 0, 0.0, ""
+        self._fit, self._fitted_at, self._fit_due_s, self._doubted = float("nan"), 0, 0.0, tuple[Finding, ...]()
 
     @property
     def incomplete(self) -> list[Path]:

@@ -12,9 +12,9 @@ from typing import Any
 
 from graph_slam_ros.check.checks import refused_odometry, worst_of_replay
 from graph_slam_ros.check.columns import Collector
-from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import GraphSlamError, SingularError
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.measurements.types import END
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.overview.chosen_inputs import Inputs

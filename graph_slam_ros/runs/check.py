@@ -9,11 +9,11 @@ import numpy as np
 
 from graph_slam_ros.check.checks import check_columns, with_inputs
 from graph_slam_ros.check.columns import Collector, Columns
-from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
 from graph_slam_ros.check.gyro import of_gyro_or_wheels
 from graph_slam_ros.check.moving_landmarks import moving_names, without
 from graph_slam_ros.check.trial import check_doubted, check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.findings.finding import Finding, Severity, in_order, with_one_value
 from graph_slam_ros.measurements.types import Measured, Sightings
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES

@@ -6,12 +6,12 @@ Both are made from ``run.json``. So they are the same for a live run, a replay a
 import shlex
 import textwrap
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
-from graph_slam_ros.check.finding import FOLLOWS, KINDS
-from graph_slam_ros.measurements.reasons import Effect, explain, remedy
+from graph_slam_ros.findings.finding import Finding, in_order
+from graph_slam_ros.findings.table import DOUBTS, OF_STAMPS, Effect, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam.frontend.gyro import GyroState
 
@@ -32,22 +32,7 @@ _MENDED = (  # of what is noted, signs of a wrong setting
     *("not_in_use", "gyro_waiting", "gyro_silent", "gyro_doubted"),
 )
 _TWO, _MANY, _FEWEST = " places fit: ", 0.25, 4  # of the reasons; part and number of landmarks
-_CONTRADICT = (
-    "graph_slam explain RUN says why. Check units (metres and radians), signs (y and bearings to the left), the place "
-    "of the sensor (TF or {0}.mount), its clock ({0}.offset_s) and ids that are used twice. If only its noise is "
-    "larger than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
-)
-_CONFUSED = (
-    "Landmarks a few metres apart are confused less with a density that is theirs, e.g. for 2 m "
-    "--set landmarks.density_per_m=0.4; and with classes, sizes or ids"
-)
-_ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another run"
-_NOT_CONVERGED = (
-    "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that are "
-    "believed contradict each other: graph_slam explain RUN lists those that fit worst"
-)
-_CONTRADICTED = "measurements contradict each other, so more iterations do not help: graph_slam explain RUN says which"
-_EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
+_UNNAMED = "sightings without identity"
 
 
 def text(summary: Summary) -> list[str]:
@@ -89,20 +74,6 @@ def _gyro(summary: Summary) -> Iterator[str]:
     if gyro := summary.get("gyro"):
         bias = ", ".join(f"{b:.5f} +- {s:.5f}" for b, s in zip(gyro["bias"], gyro["sigma"], strict=True))
         yield f"gyro       bias {bias} rad/s; {gyro['state']}"
-
-
-def _gyro_faults(summary: Summary) -> Iterator[str]:
-    """Yield why the gyro has no part in odometry, or in most of it; empty if it has."""
-    gyro, inputs = summary.get("gyro"), summary.get("inputs", {})
-    if not gyro:
-        return
-    name, counted = gyro["name"], summary["counters"].get(gyro["name"], {})
-    steps = max((counts["used"] for counts in inputs.values() if counts["use"] == "odometry"), default=0)
-    without, reason = max((counted.get(one, 0), one) for one in ("gyro_silent", "gyro_waiting"))
-    if gyro["state"] == "doubted":
-        yield GyroState(**gyro).fault
-    elif without > _MOSTLY * steps and inputs.get(name, {}).get("used"):
-        yield f"{name}: in {without} of {steps} steps odometry turned without the gyro: {remedy(name, reason)}"
 
 
 def noise(summary: Summary) -> Iterator[str]:
@@ -173,116 +144,199 @@ def table(summary: Summary) -> list[str]:
     wide = max(5, *map(len, inputs))
     units, names = zip(*(title.rpartition(" ")[::2] for title in INPUT_COLUMNS.values()), strict=True)
     lines = [f"{'':{wide}s}" + "".join(f"{unit:>{_COLUMN}s}" for unit in units)]
+    hidden = {code for one in of_run(summary) for code in one.hides}
     lines.append(f"{'input':{wide}s}" + "".join(f"{name:>{_COLUMN}s}" for name in names))
     for name, counts in inputs.items():
-        refused = _counted(summary, name, Effect.REFUSED)
+        refused = _counted(summary, name)
         numbers = ((counts | {"refused": sum(refused.values())})[column] for column in INPUT_COLUMNS)
         lines.append(f"{name:{wide}s}" + "".join(f"{'-' if n is None else n:>{_COLUMN}}" for n in numbers))
         for reason, times in list(refused.items())[:_MOST_REASONS]:
             lines += textwrap.wrap(f"{reason} {times}: {explain(reason).meaning}", _WIDTH - 2, initial_indent="  ")
-            if mend := _remedy(summary, name, reason):
+            if reason not in hidden and (mend := _remedy(summary, name, reason)):
                 lines += textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent="    ", subsequent_indent="       ")
     return lines
 
 
-def findings(summary: Summary) -> tuple[list[str], list[str]]:
-    """Shortcomings and doubts of a run; none where its summary is not whole."""
+def findings(summary: Summary) -> list[Finding]:
+    """Return what is wrong with a run, the most severe first; nothing where its summary is not whole."""
     with suppress(LookupError, TypeError, ValueError, AttributeError):
-        return [*shortcomings(summary)], [*doubts(summary)]
-    return [], []
+        return of_run(summary)
+    return []
 
 
 def shortcomings(summary: Summary) -> Iterator[str]:
     """Yield the reasons why the result is incomplete, one sentence each; empty if it is complete."""
-    inputs: Mapping[str, Any] = summary.get("inputs", {})
-    causes = list(checked(summary, "error")) or ([] if is_explained(summary) else list(_uncorrected(summary)))
-    follows = _cause(summary)[1]
-    yield from causes
-    if summary.get("failing"):
-        yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
-    elif not (summary.get("converged", True) or causes):
-        is_doubtful = any(_believed(counts) < 1.0 - _DOUBTED for counts in inputs.values())
-        yield f"the last solve did not converge ({summary['stop']}): {_CONTRADICTED if is_doubtful else _NOT_CONVERGED}"
-    if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
-        yield f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused: {_ON_JUMP}"
-    for name, counts in inputs.items():
-        is_odometry = counts["use"] in MOTION
-        if (causes or not is_odometry) and next(iter(_counted(summary, name, Effect.REFUSED)), "") in follows:
-            continue
-        if not counts["used"] and (counts["use"] != "odometry" or counts["received"] == 0):
-            yield _unused(summary, name, counts["received"])
-        elif _is_mostly_refused(summary, name):
-            yield f"{name}: most of it was refused: {_because(summary, name, _counted(summary, name, Effect.REFUSED))}"
-        elif not (is_odometry or causes) and (why := contradicts(name, counts["believed"] or 0, counts["used"])):
-            yield why
-        counted, received = summary["counters"].get(name, {}), counts["received"] or counts["used"]
-        if is_odometry and (why := leaves_plane(name, counted, received)):
-            yield why
-        jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
-        if is_odometry and jumps > max(_MOST_JUMPS, _JUMPY * received) and "jump" not in follows:
-            yield (
-                f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
-                "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
-            )
-        if (count := counted.get("frozen", 0)) > 2 and "frozen" not in follows:
-            yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
-    for name, counted in summary["counters"].items():
-        for why in ({"mount_assumed", "mount_unknown"} - {*follows}) & counted.keys():
-            yield f"{name}: no transform has the place of its sensor, and one is assumed: {remedy(name, why)}"
-    yield from _gyro_faults(summary)
-    yield from association_faults(summary.get("association", {}))
-    alarm: Mapping[str, Any] = next(reversed(summary.get("displacements", ())), {})
-    if not causes and is_undecided(alarm):
-        hint = _CONFUSED if summary.get("association") else "ids, units and clocks: graph_slam check BAG"
-        yield f"{alarm['text']}, which is not decided: the end of the path is by odometry. {hint}"
-    if not sum(counts["believed"] or 0 for counts in inputs.values()):
-        yield (
-            "this is odometry alone: no landmark, fix or closure is in the result; "
-            "graph_slam check BAG says what of the recording cannot be used"
-        )
-    yield from _without_effect(summary.get("noise", ()))
-    if summary["landmarks"] and summary["sightings"] == summary["landmarks"] and not causes:
-        yield "no landmark was seen twice, so they correct nothing: do ids change? Each landmark needs its own"
+    yield from (str(one) for one in of_run(summary) if one.severity == "error")
 
 
-def _without_effect(noise: Collection[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the inputs with so much noise that odometry is not measured by anything, from ``Noise`` as dictionaries."""
-    measured = [one for one in noise if one["dof"] >= 1.0]
-    if all(one["label"] != "odometry" for one in measured):
-        for name in dict.fromkeys(one["source"] for one in measured if one["per_dof"] < _TOO_WIDE):
-            yield (
-                f"{name}: its noise is stated more than 100 times too large, so it corrects nothing, and this is "
-                f"odometry alone: --set {name}.noise=sigmas --set {name}.sigma_m=..."
-            )
+def doubts(summary: Summary) -> Iterator[str]:
+    """Yield what makes the result doubtful, or worse than it could be, one sentence each."""
+    yield from (str(one) for one in of_run(summary) if one.severity == "warning")
 
 
-def contradicts(name: str, accepted: int, count: int) -> str:
-    """Return why an input is of little use if less than half of its measurements are believed; else empty."""
-    if accepted >= _MOSTLY * count:
-        return ""
-    return f"{name}: only {accepted} of {count} are believed: {_CONTRADICT.format(name)}"
+def of_run(summary: Summary) -> list[Finding]:
+    """Return what is wrong with a run, without what follows from something else."""
+    inputs = [one for name in summary.get("inputs", {}) for one in _of_input(summary, name)]
+    solves = _of_solves(summary, is_doubtful=any(one.code == "contradicted" for one in inputs))
+    found = [*of_map(summary), *_of_recording(summary), *solves, *inputs]
+    return in_order([*found, *_of_counters(summary), *_of_sightings(summary)])
 
 
-def leaves_plane(name: str, counted: Mapping[str, int], received: int) -> str:
-    """Return that an odometry is not of a plane, if many of its poses are outside; else empty."""
-    if counted.get("out_of_plane", 0) <= _OUT_OF_PLANE * received:
-        return ""
-    return f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"
-
-
-def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
-    """Yield why the association in a ``MapView.association_report`` is not to be believed; empty if it is."""
+def of_map(summary: Summary) -> Iterator[Finding]:
+    """Yield what a map itself shows to be wrong, at the end of a run or while it goes on."""
+    for one in summary.get("uncorrected", ()):
+        settings = tuple(f"{key}={value}" for key, value in one["settings"].items() if f"{key}=" not in one["text"])
+        text = f"{one['text']} (graph_slam calibrate BAG compares the causes)"
+        yield Finding(one["code"], "error", text=text, settings=settings, remedy="")
+    if (gyro := summary.get("gyro")) and gyro["state"] != "used":
+        name, code, fault = gyro["name"], f"gyro_{gyro['state']}", GyroState(**gyro).fault
+        note = Finding(code, "note", text=f"{name}: {explain(code).meaning}", source=name)
+        yield Finding(code, "error", text=fault, remedy="") if fault else note
+    found: Mapping[str, Any] = summary.get("association", {})
     if found.get("is_doubtful"):
         missing, lost = 100.0 * found["missing_part"], 100.0 * found["lost_part"]
-        yield (
-            f"sightings without identity: {missing:.0f} % of the landmarks that should be seen are not, and the sensor "
-            f"misses {lost:.1f} %: the map is probably wrong. {_CONFUSED}"
-        )
+        text = f"{_UNNAMED}: {missing:.0f} % of the landmarks that should be seen are not, and the sensor misses "
+        yield Finding("confused", "error", text=f"{text}{lost:.1f} %: the map is probably wrong")
     if not found.get("is_whole", True):
-        yield (
-            "sightings without identity: landmarks may be in the map twice, the search for those reached its limit "
-            f"(moves_left). {_CONFUSED}"
+        text = f"{_UNNAMED}: landmarks may be in the map twice, the search for those reached its limit (moves_left)"
+        yield Finding("confused", "error", text=text)
+    if count := sum(len(rival["only_here"]) for rival in summary.get("rivals", ())):
+        text = f"ambiguous: {count} loop closures that are not believed agree with one another as well"
+        yield Finding("ambiguous", "warning", text=text)
+    landmarks, waiting = summary.get("landmarks", 0), summary.get("waiting", {})
+    undecided, every = sum(_TWO in reason for reason in waiting.values()), landmarks + len(waiting)
+    if landmarks >= _FEWEST and undecided >= max(_FEWEST, _MANY * every):
+        text = (
+            f"ranges alone: of {undecided} of {every} landmarks two places fit, one on either side of the path, so "
+            "they are not used; others may be in the map on the wrong side, and covariances do not contain that"
         )
+        yield Finding("sides_unknown", "warning", text=text)
+    if renewed := summary.get("renewed_ids"):
+        yield Finding("ids_renewed", "warning", text=f"ids_renewed: {renewed}")
+    condensed, lost, wider = (summary.get("counters", {}).get("map", {}).get(name, 0) for name in VISITS)
+    doubted, visits = lost + wider, condensed + lost
+    if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
+        text = (
+            f"map.condense: {doubted} of {visits} visits contradict themselves or the others, so the noise or the "
+            "calibration is wrong, and the map may be much worse than with all keyframes"
+        )
+        yield Finding("visits_contradict", "warning", text=text)
+
+
+def _of_recording(summary: Summary) -> Iterator[Finding]:
+    """Yield the worst finding of the recording; ``graph_slam check`` lists all."""
+    if found := summary.get("check"):
+        follows = (*DOUBTS, "confused") if found["severity"] == "error" else ()
+        text = f"{found['code']}: {found['text']} (graph_slam check BAG lists all)"
+        source, settings = found.get("evidence", {}).get("input", ""), tuple(found["settings"])
+        yield Finding(found["code"], found["severity"], text=text, settings=settings, source=source, follows=follows)
+
+
+def _of_solves(summary: Summary, *, is_doubtful: bool) -> Iterator[Finding]:
+    """Yield that the last solve failed or did not converge."""
+    if summary.get("failing"):
+        text = f"the last solve failed ({summary['failing']}), and the estimate is the one before it"
+        yield Finding("solve_failed", "error", text=text)
+    elif not summary.get("converged", True):
+        text = f"the last solve did not converge ({summary['stop']})"
+        yield Finding("contradictory" if is_doubtful else "not_converged", "error", text=text)
+
+
+def _of_input(summary: Summary, name: str) -> Iterator[Finding]:
+    """Yield why an input is not used, or little of it, or is not believed."""
+    counts, counted = summary["inputs"][name], summary["counters"].get(name, {})
+    received, refused, is_odometry = counts["received"], _counted(summary, name), counts["use"] in MOTION
+    if received == 0 and not counts["used"]:
+        yield Finding("unused", "error", text=f"{name}: no message came", source=name)
+    elif not counts["used"] and counts["use"] != "odometry":
+        messages = "" if received is None else f" of {received} messages"
+        noted = refused or _counted(summary, name, Effect.NOTED)
+        yield _little_used(summary, name, f"nothing{messages} was used", noted)
+    elif _is_mostly_refused(summary, name):
+        yield _little_used(summary, name, "most of it was refused", refused)
+    elif not is_odometry:
+        has_cause = name == summary.get("check", {}).get("evidence", {}).get("input")
+        found = contradicted(name, counts["believed"] or 0, counts["used"])
+        yield from (one for one in found if one.severity == "error" or not has_cause)
+    if is_odometry:
+        yield from leaves_plane(name, counted, received or counts["used"])
+        jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
+        if jumps > max(_MOST_JUMPS, _JUMPY * (received or counts["used"])):
+            text = (
+                f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
+                "metres and radians? A robot as fast as that"
+            )
+            yield Finding("jump", "error", text=text, settings=("odometry.max_speed_m_s=...",), source=name)
+        if (count := counted.get("frozen", 0)) > 2:
+            yield Finding("frozen", "error", text=f"{name}: {explain('frozen').meaning} ({count} times)", source=name)
+
+
+def contradicted(name: str, accepted: int, count: int) -> Iterator[Finding]:
+    """Yield that many measurements of an input are not believed; with more than half it is of little use."""
+    if accepted < _MOSTLY * count:
+        text = f"{name}: only {accepted} of {count} are believed"
+        yield Finding("contradicted", "error", text=text, source=name)
+    elif accepted < (1.0 - _DOUBTED) * count:
+        text = f"{name}: {100.0 * (1.0 - accepted / count):.0f} % of {count} are not believed"
+        yield Finding("contradicted", "warning", text=text, source=name)
+
+
+def leaves_plane(name: str, counted: Mapping[str, int], received: int) -> Iterator[Finding]:
+    """Yield that an odometry is not of a plane, if many of its poses are outside."""
+    if counted.get("out_of_plane", 0) > _OUT_OF_PLANE * received:
+        text, settings = f"{name} leaves the plane: these are three dimensions", ("world.dimensions=3",)
+        yield Finding("out_of_plane", "error", text=text, settings=settings, source=name)
+
+
+def _of_counters(summary: Summary) -> Iterator[Finding]:
+    """Yield what counters show: a stop, a place of a sensor that is assumed, an idle gyro, a topic of two drivers."""
+    if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
+        text = f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused"
+        yield Finding("stopped", "error", text=text)
+    inputs: Mapping[str, Any] = summary.get("inputs", {})
+    for name, counted in summary["counters"].items():
+        for why in {"mount_assumed", "mount_unknown"} & counted.keys():
+            text = f"{name}: no transform has the place of its sensor, and one is assumed"
+            yield Finding(why, "error", text=text, source=name)
+    steps = max((counts["used"] for counts in inputs.values() if counts["use"] == "odometry"), default=0)
+    if (gyro := summary.get("gyro")) and inputs.get(name := gyro["name"], {}).get("used"):
+        counted = summary["counters"].get(name, {})
+        without, reason = max((counted.get(one, 0), one) for one in ("gyro_silent", "gyro_waiting"))
+        if without > _MOSTLY * steps and gyro["state"] != "doubted":
+            text = f"{name}: in {without} of {steps} steps odometry turned without the gyro"
+            yield Finding(reason, "error", text=text, source=name)
+    for name, count in Counter(name.partition("#")[0] for name in inputs).items():
+        if count > 1:
+            text = (
+                f"{name}: {count} odometries are on its topic ({name}, {name}#2, ...), or one that jumps: is it in "
+                "metres and radians?"
+            )
+            yield Finding("two_publishers", "warning", text=text, source=name)
+
+
+def _of_sightings(summary: Summary) -> Iterator[Finding]:
+    """Yield that nothing corrects odometry, or that landmarks contradict it or themselves."""
+    alarm: Mapping[str, Any] = next(reversed(summary.get("displacements", ())), {})
+    if is_undecided(alarm):
+        text = f"{alarm['text']}, which is not decided: the end of the path is by odometry"
+        yield Finding("elsewhere", "error", text=text)
+    if not sum(counts["believed"] or 0 for counts in summary.get("inputs", {}).values()):
+        text = "this is odometry alone: no landmark, fix or closure is in the result"
+        yield Finding("odometry_alone", "error", text=text)
+    measured = [one for one in summary.get("noise", ()) if one["dof"] >= 1.0]
+    if all(one["label"] != "odometry" for one in measured):
+        for name in dict.fromkeys(one["source"] for one in measured if one["per_dof"] < _TOO_WIDE):
+            text = (
+                f"{name}: its noise is stated more than 100 times too large, so it corrects nothing, and this is "
+                "odometry alone"
+            )
+            yield Finding("noise_too_large", "error", text=text, source=name)
+    landmarks = summary.get("landmarks", 0)
+    if landmarks and summary["sightings"] == landmarks:
+        yield Finding("not_seen_again", "error", text="no landmark was seen twice, so they correct nothing")
+    contested = {} if summary.get("renewed_ids") else summary.get("contested", {})
+    for name, (out, count) in contested.items() if len(contested) <= _MANY * landmarks else ():
+        yield Finding("contested", "warning", text=f"{name}: {out} of {count} sightings are not believed")
 
 
 def is_undecided(alarm: Mapping[str, Any]) -> bool:
@@ -290,77 +344,9 @@ def is_undecided(alarm: Mapping[str, Any]) -> bool:
     return "held_back" in alarm and all(alarm.get(key) is None for key in ("decided_ns", "ended_ns", "segment"))
 
 
-def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield other explanations of the measurements that could not be ruled out: ``Backend.rivals`` as dictionaries."""
-    if count := sum(len(rival["only_here"]) for rival in rivals):
-        yield f"ambiguous: {count} loop closures that are not believed agree with one another as well"
-
-
-def doubts(summary: Summary) -> Iterator[str]:
-    """Yield a sentence for each input of which many measurements are rejected, and for what makes a result doubtful.
-
-    That are visits that contradict others, and other explanations.
-    """
-    if is_explained(summary):
-        return
-    yield from checked(summary, "warning")
-    for text in ambiguities(summary.get("rivals", ())):
-        yield f"{text} (graph_slam explain RUN)"
-    yield from filter(None, [wrong_sides(summary.get("landmarks", 0), summary.get("waiting", {}))])
-    if renewed := summary.get("renewed_ids"):
-        yield renewed_text(renewed)
-    contested = {} if renewed or summary.get("uncorrected") else summary.get("contested", {})
-    for name, (out, count) in contested.items() if len(contested) <= _MANY * summary.get("landmarks", 0) else ():
-        yield f"{name}: {out} of {count} sightings are not believed: did it move, or is its id used twice?"
-    yield from visit_faults(summary["counters"].get("map", {}))
-    for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():
-        if count > 1:
-            yield (
-                f"{name}: {count} odometries are on its topic ({name}, {name}#2, ...), or one that jumps. Each needs a "
-                "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
-            )
-    for name, counts in summary.get("inputs", {}).items():
-        accepted, has_cause = _believed(counts), name == _cause(summary)[0] or summary.get("uncorrected")
-        if _MOSTLY <= accepted < 1.0 - _DOUBTED and not has_cause:
-            part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
-            yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
-
-
 def is_explained(summary: Summary) -> bool:
-    """Return whether all doubts may be consequences: of an error of the recording, or of an input mostly refused."""
-    inputs = [name for name in summary.get("inputs", ()) if "#" not in name]  # not a second odometry of a topic
-    return any(checked(summary, "error")) or any(_is_mostly_refused(summary, name) for name in inputs)
-
-
-def _is_mostly_refused(summary: Summary, name: str) -> bool:
-    refused = sum(_counted(summary, name, Effect.REFUSED).values())
-    return bool(refused > _MOSTLY * (refused + summary["inputs"][name]["used"]))
-
-
-def _believed(counts: Mapping[str, Any]) -> float:
-    """Return which part of the measurements of an input is believed; all of odometry, and of none."""
-    return 1.0 if counts["use"] in MOTION or not counts["used"] else (counts["believed"] or 0) / counts["used"]
-
-
-def _cause(summary: Summary) -> tuple[str, tuple[str, ...]]:
-    """Return the input that the finding of the recording is of, and what follows from it."""
-    if found := summary.get("check"):
-        return found.get("evidence", {}).get("input", ""), FOLLOWS.get(found.get("code", ""), ())
-    lost = [name for name, of in summary.get("inputs", {}).items() if of["use"] == "odometry" and "#" not in name]
-    own = [_counted(summary, name, Effect.REFUSED) for name in lost if _is_mostly_refused(summary, name)]
-    return "", tuple(one for one in FOLLOWS["wrong_stamps"] if own and not any(one in reasons for reasons in own))
-
-
-def _uncorrected(summary: Summary) -> Iterator[str]:
-    for one in summary.get("uncorrected", ()):
-        settings = {key: value for key, value in one["settings"].items() if f"{key}=" not in one["text"]}
-        mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in settings.items())
-        yield f"{one['text']}{mend and ': '}{mend} (graph_slam calibrate BAG compares the causes)"
-
-
-def renewed_text(found: str) -> str:
-    """Return that all ids are new from some time on, and what mends it."""
-    return f"ids_renewed: {found} {KINDS['ids_renewed']}"
+    """Return whether doubts may be consequences: of an error of the recording, or of an input mostly refused."""
+    return any(one.follows for one in of_run(summary))
 
 
 def condensed_text(summary: Mapping[str, Any]) -> str:
@@ -371,27 +357,6 @@ def condensed_text(summary: Mapping[str, Any]) -> str:
     return f"nothing: not with {why} yet, so the map grows with the distance driven" if why else ""
 
 
-def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
-    """Yield why a condensed map is worse than it should be, by how often visits ended how (``VISITS``)."""
-    condensed, lost, wider = (counted.get(name, 0) for name in VISITS)
-    doubted, visits = lost + wider, condensed + lost
-    if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
-        yield (
-            f"map.condense: {doubted} of {visits} visits contradict themselves or the others, so the noise or the "
-            "calibration is wrong, and the map may be much worse than with all keyframes: compare with --set "
-            "map.condense=false, run graph_slam check on the recording, or keep more by map.window_keyframes"
-        )
-
-
-def checked(summary: Summary, severity: str) -> Iterator[str]:
-    """Yield the worst finding of the recording if it is severe enough and a cause; ``graph_slam check`` lists all."""
-    found = summary.get("check")
-    follows = {code for one in summary.get("uncorrected", ()) for code in FOLLOWS.get(one.get("code", ""), ())}
-    if found is not None and found["severity"] == severity and found["code"] not in follows:
-        mend = " ".join(f"--set {shlex.quote(text)}" for text in found["settings"])
-        yield f"{found['code']}: {found['text']}{'; ' if mend else ''}{mend} (graph_slam check BAG lists all)"
-
-
 def unscaled(summary: Summary) -> Iterator[str]:
     """Yield why noise that should be estimated is as configured, though something was solved."""
     why = summary.get("noise_unknown")
@@ -399,45 +364,40 @@ def unscaled(summary: Summary) -> Iterator[str]:
         yield f"robust.noise_scale=estimated: no noise could be estimated at the end: {why}"
 
 
-def _unused(summary: Summary, name: str, received: int | None) -> str:
-    if not received and received is not None:
-        return f"{name}: no message came"
-    messages = "" if received is None else f" of {received} messages"
-    counted = _counted(summary, name, Effect.REFUSED) or _counted(summary, name, Effect.NOTED)
-    if not counted and summary["waiting"]:
-        return f"{name}: nothing{messages} was used: {len(summary['waiting'])} landmarks are not determined (waiting)"
-    return f"{name}: nothing{messages} was used: {_because(summary, name, counted)}"
-
-
-def _because(summary: Summary, name: str, counted: Mapping[str, int]) -> str:
+def _little_used(summary: Summary, name: str, what: str, counted: Mapping[str, int]) -> Finding:
+    """Return that an input is not used, or little of it, by the most frequent reason."""
     if not counted:
-        return "it holds nothing"
+        count = len(summary["waiting"])
+        why = f"{count} landmarks are not determined (waiting)" if count else "it holds nothing"
+        return Finding("unused", "error", text=f"{name}: {what}: {why}", source=name)
     reason = next(iter(counted))
-    mend = _remedy(summary, name, reason)
-    return f"{reason} {counted[reason]} ({explain(reason).meaning})" + (f"; {mend}" if mend else "")
+    text = f"{name}: {what}: {reason} {counted[reason]} ({explain(reason).meaning})"
+    mend, follows = _remedy(summary, name, reason), _follows(summary, name)
+    return Finding(reason, "error", text=text, source=name, remedy=mend, follows=follows)
+
+
+def _follows(summary: Summary, name: str) -> tuple[str, ...]:
+    """Return what may follow from an input that is mostly refused; from odometry, also that others are refused."""
+    inputs: Mapping[str, Any] = summary["inputs"]
+    if "#" in name or not _is_mostly_refused(summary, name):  # a second odometry of a topic explains nothing
+        return ()
+    lost = [one for one, of in inputs.items() if of["use"] == "odometry" and _is_mostly_refused(summary, one)]
+    own = {reason for one in lost for reason in _counted(summary, one)}
+    return (*DOUBTS, *(one for one in OF_STAMPS if one not in own)) if name in lost else DOUBTS
+
+
+def _is_mostly_refused(summary: Summary, name: str) -> bool:
+    refused = sum(_counted(summary, name).values())
+    return bool(refused > _MOSTLY * (refused + summary["inputs"][name]["used"]))
 
 
 def _remedy(summary: Summary, name: str, reason: str) -> str:
     """Return what mends a reason; of a frame that is unknown since transforms name none, what mends the transforms."""
-    if reason in _cause(summary)[1]:
-        return ""
     empty = [one for one in ("tf", "tf_static") if summary["counters"].get(one, {}).get("frame_empty")]
     return remedy(empty[0], "frame_empty") if empty and reason == "frame_unknown" else remedy(name, reason)
 
 
-def _counted(summary: Summary, name: str, effect: Effect) -> dict[str, int]:
+def _counted(summary: Summary, name: str, effect: Effect = Effect.REFUSED) -> dict[str, int]:
     """Reasons of one effect for an input, the most frequent first."""
     some = [(r, times) for r, times in summary["counters"].get(name, {}).items() if explain(r).effect is effect]
     return dict(sorted(some, key=lambda one: (-one[1], one[0])))
-
-
-def wrong_sides(landmarks: int, waiting: Mapping[str, str]) -> str:
-    """Return that landmarks may be on the wrong side of the path, where many that wait are undecided; else nothing."""
-    undecided = sum(_TWO in reason for reason in waiting.values())
-    if landmarks < _FEWEST or undecided < max(_FEWEST, _MANY * (landmarks + len(waiting))):
-        return ""
-    return (
-        f"ranges alone: of {undecided} of {landmarks + len(waiting)} landmarks two places fit, one on either side of "
-        "the path, so they are not used; others may be in the map on the wrong side, and covariances do not contain "
-        "that. Drive more turns in sight of them, or add bearings or surveyed landmarks (landmarks.surveyed)"
-    )

@@ -12,7 +12,6 @@ from typing import Any
 from graph_slam_ros.check.checks import first_of_replay, worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.config.config import with_survey
-from graph_slam_ros.measurements.reasons import warnings as mendable
 from graph_slam_ros.measurements.types import END, Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF_STATIC, MessageConverter
 from graph_slam_ros.overview.chosen_inputs import Inputs, choose_inputs
@@ -21,7 +20,7 @@ from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_start
-from graph_slam_ros.runs.outcome import doubts, is_explained, is_undecided, unscaled
+from graph_slam_ros.runs.outcome import doubts, is_undecided, of_run, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, MapView
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
@@ -269,6 +268,6 @@ def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]
 
 
 def _warnings(view: MapView, summary: dict[str, Any]) -> list[str]:
-    has_cause = bool(summary.get("uncorrected")) or is_explained(summary)
-    alarms = [] if has_cause else [str(one) for one in view.alarms if not is_undecided(asdict(one))]
-    return [*doubts(summary), *alarms, *unscaled(summary), *mendable(summary["counters"])]
+    hidden = {code for one in of_run(summary) for code in one.hides}
+    alarms = [] if "displaced" in hidden else [str(one) for one in view.alarms if not is_undecided(asdict(one))]
+    return [*doubts(summary), *alarms, *unscaled(summary)]

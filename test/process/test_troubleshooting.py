@@ -15,8 +15,8 @@ import pytest
 from places import ROOT
 from rows import each
 
+from graph_slam_ros.findings.table import COUNTED
 from graph_slam_ros.formats.parameters import read_parameters
-from graph_slam_ros.measurements.reasons import REASONS
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam import Config
@@ -27,7 +27,7 @@ HEAD = "| counter | effect | what it means | remedy |\n|---|---|---|---|\n"
 
 
 def table():
-    rows = (f"| `{name}` | {row.effect.value} | {row.meaning} | {row.remedy} |" for name, row in REASONS.items())
+    rows = (f"| `{name}` | {row.effect.value} | {row.meaning} | {row.remedy} |" for name, row in COUNTED.items())
     return HEAD + "\n".join(rows) + "\n"
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from graph_slam_ros import edge_tags, plugins
-from graph_slam_ros.measurements.reasons import REASONS
+from graph_slam_ros.findings.table import COUNTED
 from graph_slam_ros.measurements.types import AngularVelocity, Closure, Fix, Measured, Odometry, to_record
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
@@ -124,7 +124,7 @@ def _converted(
     except NotYet:
         raise
     except MessageError as reason:
-        if isinstance(reason, PluginFault) or str(reason) in REASONS:
+        if isinstance(reason, PluginFault) or str(reason) in COUNTED:
             raise
         raise PluginFault(f"{plugin} refuses a message: {' '.join(str(reason).split())}") from None
     except Exception as error:  # whatever another's function does

@@ -171,19 +171,12 @@ class GyroState:
 
     @property
     def fault(self) -> str:
-        """The reason why the gyro is not used; empty if it is."""
-        if self.state == "waiting":
-            return (
-                f"{self.name}: the gyro waits until the robot stands and shows its bias, if that is within "
-                "gyro.bias_sigma; the rotation is that of odometry alone"
-            )
-        if self.state == "silent":
-            return f"{self.name}: the gyro is silent; the rotation is that of odometry alone (gyro.timeout_s)"
-        if self.state == "doubted":
-            turns = "" if self.ratio is None else f", it turns {self.ratio:.3g} times as much as odometry"
-            contradict = f"{self.name}: gyro and odometry contradict each other{turns}; the gyro is not used."
-            return f"{contradict} {_cause(self.ratio, self.name)}"
-        return ""
+        """The reason why the gyro is doubted, and what mends it; empty if it is not."""
+        if self.state != "doubted":
+            return ""
+        turns = "" if self.ratio is None else f", it turns {self.ratio:.3g} times as much as odometry"
+        contradict = f"{self.name}: gyro and odometry contradict each other{turns}; the gyro is not used."
+        return f"{contradict} {_cause(self.ratio, self.name)}"
 
     def __str__(self) -> str:
         """The state and the bias, for a person."""

@@ -9,10 +9,10 @@ from typing import Any
 
 from graph_slam_ros import __version__
 from graph_slam_ros.analysis.consistency import should_be
-from graph_slam_ros.analysis.explain import explain_run
+from graph_slam_ros.analysis.explain import inert_gates
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.config.config import Config, flatten, parameters
-from graph_slam_ros.measurements.reasons import Effect, explain, remedy
+from graph_slam_ros.findings.table import Effect, explain, remedy
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam.noise.scale import NoiseScale
@@ -46,14 +46,13 @@ def verdict(
     doubts = [f"a part of the run is lost: {loss} {again}" for loss in losses[:1]]
     if summary.get("ended") is False:
         doubts = [f"it is still being written, or was cut off, and this is its map so far {again}"]
-    short, more = outcome.findings(summary)
+    found = outcome.findings(summary)
+    short, more = ([str(one) for one in found if one.severity == kind] for kind in ("error", "warning"))
     if summary.get("is_incomplete"):  # so are its counters
         short, more = [f"the run was ended before its last results were written {again}"], []
     doubts += more
-    if not short and not summary.get("converged", True):
-        short = ["the last solve did not converge"]
     doubts += list(scores.warnings) if scores is not None else []
-    doubts += [line.removeprefix("warning: ") for line in explain_run(saved) if line.startswith("warning: ")]
+    doubts += inert_gates(saved)
     doubts += _covariances(saved, scores)
     judged = [e.is_in for e in saved.entries if e.verdict]
     if sum(judged) < _NEARLY_ALL * len(judged):

@@ -6,8 +6,8 @@ from planted_faults import FAULTS, of, planted
 from reliability import times
 
 from graph_slam_ros.analysis.evaluation import evaluate
-from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.cli import main
+from graph_slam_ros.findings.table import CHECKED
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.replay import replay
@@ -245,7 +245,7 @@ def test_each_finding_is_planted():
     elsewhere |= {*of_others.split()}  # test_recordings_of_others.py
     elsewhere |= {"landmark_moves", "odometry_short"}  # test_moving_landmarks.py
     tested = {code for _, codes, _ in PLANTED.values() for code in codes}
-    assert KINDS.keys() - {code for _, codes in FAULTS.values() for code in codes.split()} - tested == elsewhere
+    assert CHECKED.keys() - {code for _, codes in FAULTS.values() for code in codes.split()} - tested == elsewhere
 
 
 @pytest.mark.parametrize("seconds", times([0.2], [0.2, -0.2]))

@@ -75,7 +75,7 @@ def assert_the_node_says_so(slam):
     view = slam.view
     assert np.trace(view.pose_covariance) > 2.0 * np.trace(view.solver.marginal(view.keyframes.ids[-1:])[0])
     (one,) = view.uncorrected_so_far
-    of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0, "doubted": ""}
+    of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0}
     estimate = estimate_of(slam, correction=view.correction, unseen=UnseenWay(0, 0), **of)
     facts = Facts("active", estimate=estimate)
     health = judge(facts, Config())
@@ -133,7 +133,7 @@ def test_a_sensor_that_was_knocked_is_told_and_since_when_though_odometry_was_in
 
 
 def test_an_error_of_the_recording_makes_a_fit_meaningless():
-    off = {"text": "clock_offset: ...", "settings": {"detections.offset_s": 0.1}}
+    off = {"code": "clock_offset", "text": "clock_offset: ...", "settings": {"detections.offset_s": 0.1}}
     summary = {"counters": {}, "inputs": {}, "uncorrected": [off]}
     axes = {"check": {"severity": "error", "code": "axes", "text": "", "settings": []}}
     for of_check, code in (({}, "clock_offset"), (axes, "axes")):

@@ -8,11 +8,11 @@ from reliability import times
 
 from graph_slam_ros.check.checks import check_columns
 from graph_slam_ros.check.columns import Columns, FixColumns, OdometryColumns, SightingColumns, TopicColumns, in_order
-from graph_slam_ros.check.finding import KINDS, SEVERITIES
 from graph_slam_ros.cli.check import lines
+from graph_slam_ros.findings.finding import SEVERITIES
+from graph_slam_ros.findings.table import COUNTED, TABLE
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
-from graph_slam_ros.measurements.reasons import REASONS
 from graph_slam_ros.slam import Config, Counters
 
 START_NS = 1_700_000_000 * 10**9
@@ -81,7 +81,7 @@ def columns(seed):
         for name, own, use, stamp_ns in inputs
     }
     counters = Counters()
-    for reason in rng.choice(list(REASONS), 3):
+    for reason in rng.choice(list(COUNTED), 3):
         counters.count(str(rng.choice(["odom", "detections", "tf"])), str(reason), int(rng.integers(1, 500)))
     links = tuple((pick(), pick()) for _ in range(rng.integers(0, 6)))
     assumed = {"detections.offset_s": -2.5, "detections.mount": "0 0 0 0 0 0", "odom.mount": "0 0 0 0 0 0"}
@@ -99,7 +99,7 @@ def test_no_columns_make_a_check_fail():
         found = check_columns(columns(seed))
         assert [SEVERITIES.index(one.severity) for one in found] == sorted(SEVERITIES.index(f.severity) for f in found)
         for one in found:
-            assert one.code in KINDS.keys() | REASONS.keys()
+            assert one.code in TABLE
             assert json.loads(json.dumps(one.as_dict(), allow_nan=False))["code"] == one.code
             assert all(line.strip() for line in lines(one))
             for setting in one.settings:

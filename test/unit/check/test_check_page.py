@@ -4,7 +4,7 @@ import re
 
 from places import ROOT
 
-from graph_slam_ros.check.finding import ENDS, KINDS
+from graph_slam_ros.findings.table import CHECKED
 
 PAGE = ROOT / "docs/check.md"
 HEAD = "| finding | what was measured | what mends it |\n|---|---|---|\n"
@@ -13,7 +13,7 @@ HEAD = "| finding | what was measured | what mends it |\n|---|---|---|\n"
 def table(text):
     """A row for each finding, of which the page says what was measured; those that end the list are marked."""
     ends, said = " (ends the list)", dict(re.findall(r"^\| `(\w+)`.*? \| (.*?) \| .* \|$", text, re.M))
-    rows = (f"| `{name}`{ends if name in ENDS else ''} | {said[name]} | {mend} |" for name, mend in KINDS.items())
+    rows = (f"| `{name}`{ends * row.ends} | {said[name]} | {row.remedy} |" for name, row in CHECKED.items())
     return HEAD + "\n".join(rows) + "\n"
 
 

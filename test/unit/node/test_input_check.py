@@ -71,7 +71,7 @@ def run_job(check, clock):
 def test_an_input_that_contradicts_odometry_is_named_with_what_mends_it(sensor, text, clock):
     findings = checked(clock, 400, **sensor).findings
     assert len(findings) == (text is not None)
-    for one in findings:
+    for one in map(str, findings):
         assert one.startswith(text)
         assert "correct the driver (REP 103" in one
 
@@ -116,7 +116,7 @@ def test_odometry_is_checked_by_itself_with_its_twist(wrong, text, clock):
         check.add("/odom", ["odom"], 10**15 + k * NS // 20, converter.convert("odom", odometry(k, **wrong)))
     run_job(check, clock)
     assert len(check.findings) == (text is not None), check.findings
-    for one in check.findings:
+    for one in map(str, check.findings):
         assert one.startswith(text)
 
 

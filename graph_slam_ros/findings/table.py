@@ -1,17 +1,17 @@
-"""Every reason that is counted: what happens to the message, what it means, and what mends it.
+"""The table of all that can be wrong: what it means, what mends it, what it hides.
 
-``Counters`` count by source and reason. Live diagnostics, the table at the end of a replay and docs/troubleshooting.md
-explain a reason by its row here.
+A code of ``COUNTED`` is the name of a counter: it happens to a measurement. One of ``CHECKED`` is found by a check of
+a recording, which measures it; docs/check.md says what. Diagnostics, the end of a replay, ``check``, the report, and
+the tables of docs/troubleshooting.md and docs/check.md explain a code by its row here.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 
 
 class Effect(Enum):
-    """The effect of a reason on a measurement."""
+    """The effect on a measurement."""
 
     REFUSED = "refused"
     """It is not used, and something is lost."""
@@ -19,32 +19,63 @@ class Effect(Enum):
     """It is used after a change."""
     NOTED = "noted"
     """Nothing is lost: a repetition, what the parameters ask for, or an event."""
+    FOUND = "found"
+    """It is counted nowhere."""
 
 
 @dataclass(frozen=True, slots=True)
-class Reason:
+class Row:
     """One row of the table.
 
     Attributes
     ----------
-    meaning : what has happened, in one sentence without a full stop
-    remedy : the parameter or command that mends it, where ``INPUT`` is the name of the input; empty where nothing is
+    meaning : what has happened, in one sentence without a full stop; empty where the finding itself has it
+    remedy : what mends it, beyond the settings of a finding; ``INPUT`` is the name of the input; empty where nothing is
         to be done
+    hides : codes that are no finding of their own beside it, because they follow from it
+    ends : whether other findings mean nothing while it is there
     """
 
     effect: Effect
     meaning: str
     remedy: str = ""
+    hides: tuple[str, ...] = ()
+    ends: bool = False
 
 
-_refused, _repaired, _noted = (partial(Reason, effect) for effect in Effect)
+_refused, _repaired, _noted, _found = (partial(Row, effect) for effect in Effect)
+_checked, _ends = partial(_found, ""), partial(_found, "", ends=True)
+
+NO_IDS = ("landmarks.association=joint", "landmarks.id_from=none")
 _COVARIANCE = "correct the driver, or set INPUT.noise=sigmas (odometry: odometry.noise=density)"
 _SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
 _FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the messages name it"
 _GAPS = "publish the moving transform at 10 Hz or more, all the time; inputs.tf_wait_s where it comes late"
 _SPACE = "world.dimensions=3"
+_DRIVER = "correct the driver (REP 103: metres, radians, x ahead, y to the left, turning left is positive)"
+_DENSITY = "correct the driver; until then set odometry.noise=density"
+_ONE_CLOCK = "synchronise the clocks (chrony, PTP); set use_sim_time for all nodes or for none"
+_ONE_PUBLISHER = "one publisher: ros2 topic info -v TOPIC"
+_TOPIC_EACH = "one publisher (ros2 topic info -v TOPIC), or a topic and an input for each (inputs.names)"
+_ID = "one id for each landmark"
+_NO_ID = f"{_ID}, or {', '.join(NO_IDS)}"
+_WHEELS = "choose the topic of the wheels with --odom"
 
-REASONS: dict[str, Reason] = {
+OF_STAMPS = (
+    *("after_odometry", "before_odometry", "late", "odometry_gap", "duplicate_stamp", "other_publisher"),
+    *("overflow", "frozen", "jump"),
+)
+"""What follows from stamps that are wrong, and from odometry that is refused."""
+_OF_FIT = ("contradictory", "not_converged", "contradicted", "elsewhere", "displaced", "slip", "contested")
+_FITTED = ("clock_offset", "clock_jump", "mount_place", "mount_moved", "mount_yaw", "odometry_scale", "turn_scale")
+DOUBTS = (
+    *(*_OF_FIT, *_FITTED, "range_scale", "odometry_over_confident", "not_seen_again", "ids_renewed"),
+    *("ambiguous", "sides_unknown", "visits_contradict", "two_publishers"),
+)
+"""What may follow from an input that is wrong, or mostly refused."""
+_OF_A_PATH = ("odometry_slips", "landmark_moved", "map_breaks", "id_reused", "ids_unsure", "outliers", "over_confident")
+
+COUNTED: dict[str, Row] = {
     # -- stamps and order
     "bad_stamp": _refused("the stamp is negative, beyond 2^31 s, or has 1e9 ns or more", "correct the driver's stamps"),
     "zero_stamp": _refused("the stamp is zero", "have the driver fill in header.stamp"),
@@ -60,12 +91,14 @@ REASONS: dict[str, Reason] = {
     "odometry_gap": _refused("odometry was silent, or jumped, then", "find out why its driver paused"),
     "overflow": _refused("too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": _noted("the same message has come before"),
-    "duplicate_stamp": _refused("odometry has two poses for one stamp", "one publisher: ros2 topic info -v TOPIC"),
+    "duplicate_stamp": _refused("odometry has two poses for one stamp", _ONE_PUBLISHER),
     "sent_again": _noted("the transform was sent before with the same stamp"),
     "lost_in_transport": _refused("the middleware lost it", "INPUT.reliability: reliable; net.core.rmem_max"),
     # -- frames
     "frame_slash_stripped": _repaired("the name of a frame began with a slash"),
-    "frame_empty": _refused("the message names no frame", "header.frame_id of its driver; or INPUT.frame"),
+    "frame_empty": _refused(
+        "the message names no frame", "header.frame_id of its driver; or INPUT.frame", hides=("frame_unknown",)
+    ),
     "frame_in_itself": _refused("a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": _refused("no transform links the message's frame to the robot", _FRAMES),
     "transform_gaps": _refused("/tf links the message's frame to the robot, but not at its stamp", _GAPS),
@@ -82,7 +115,7 @@ REASONS: dict[str, Reason] = {
     "zero_quaternion": _refused("the quaternion is zero", "have the driver fill in the orientation"),
     "denormal_quaternion": _refused("the quaternion's length is off by more than 10 %", "correct the driver"),
     "no_heading": _refused("the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
-    "out_of_plane": _noted("the pose is 0.5 m above or below the first, or tilted by 20 degrees", _SPACE),
+    "out_of_plane": _noted("the pose is 0.5 m above or below the first, or tilted by 20 degrees", _SPACE, hides=DOUBTS),
     # -- noise
     "noise_unknown": _refused("neither the message nor the parameters have its noise", _SIGMAS),
     "covariance_unknown": _repaired("the covariance is zero: the configured noise is used"),
@@ -105,12 +138,12 @@ REASONS: dict[str, Reason] = {
     "jump": _noted(
         "odometry jumped, a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
     ),
-    "other_publisher": _refused("it does not continue the odometry in use", "one publisher: ros2 topic info -v TOPIC"),
+    "other_publisher": _refused("it does not continue the odometry in use", _ONE_PUBLISHER),
     "reset_to_zero": _noted("odometry was set back to zero: a new segment begins"),
     # -- landmarks
     "no_id": _refused("the detection has no identity", "landmarks.association=joint"),
     "id_too_long": _refused("the identity has more than 128 bytes", "shorter ids, or landmarks.id_from"),
-    "id_conflict": _refused("one message has an identity at two places", "one id for each landmark"),
+    "id_conflict": _refused("one message has an identity at two places", _ID),
     "id_merged": _repaired("one message has an identity twice, at places that agree: their mean is used"),
     "id_of_an_unnamed": _refused("the identity is a name of landmarks without one", "INPUT.id_prefix"),
     "unclear_which": _refused("a detection without identity fits no landmark", "noise as large as the sensor's"),
@@ -192,24 +225,157 @@ REASONS: dict[str, Reason] = {
 }
 """By the name it is counted under; ``fault`` is for errors of the program, which are counted by their type."""
 
+CHECKED: dict[str, Row] = {
+    # -- inputs
+    "no_odometry": _ends("record nav_msgs/Odometry, or odom -> base_link on /tf"),
+    "no_landmarks": _checked("record a topic of landmarks"),
+    "input_unused": _checked("record it as a type of docs/inputs.md, or name another topic with --odom or --landmarks"),
+    "damaged": _checked(
+        "copy it again, with all of its files, or record it again", hides=("no_closure", "silent", "gap")
+    ),
+    # -- times
+    "wrong_stamps": _ends(
+        "correct the driver: header.stamp has seconds, and nanoseconds of the second (0 to 999999999)", hides=OF_STAMPS
+    ),
+    "clock_domains": _checked(f"{_ONE_CLOCK}; or set INPUT.offset_s"),
+    "latency": _checked(f"{_ONE_CLOCK}; or set INPUT.offset_s"),
+    "clock_jump": _checked(f"{_ONE_CLOCK}; cut the recording there", hides=(*_OF_A_PATH, *_OF_FIT, "clock_offset")),
+    "no_overlap": _ends(f"{_ONE_CLOCK}; or set INPUT.offset_s"),
+    "odometry_short": _checked("record odometry from the beginning to the end; find out whether its driver stopped"),
+    "time_jump": _checked(
+        "cut the recording in two; time.on_jump sets what a run does at the step",
+        hides=("odometry_jumps", "corrected", "fit_unsure"),
+    ),
+    "constant_stamps": _ends("stamp each message when it is measured (header.stamp)", hides=OF_STAMPS),
+    "coarse_stamps": _ends("stamp each message when it is measured, to the millisecond", hides=OF_STAMPS),
+    "rounded_stamps": _checked("stamp each message when it is measured, to the millisecond"),
+    "duplicates": _checked(_ONE_PUBLISHER, hides=("other_publisher", "duplicate_stamp")),
+    "two_publishers": _checked(_TOPIC_EACH, hides=("other_publisher", "duplicate_stamp", "duplicates")),
+    "out_of_order": _checked("set ordering.window_s", hides=("odometry_jumps", "corrected", "fit_unsure")),
+    "gap": _checked("check the CPU and the disk of the recorder, and the driver"),
+    "slow_odometry": _checked("publish odometry at 10 Hz or more"),
+    # -- frames
+    "frame_unlinked": _checked(_FRAMES, hides=("mount_assumed",)),
+    "two_parents": _checked("let one node only publish each frame"),
+    "seen_in_fixed_frame": _ends("publish them in the sensor's frame"),
+    "odometry_in_map": _checked(_WHEELS),
+    # -- odometry
+    "pose_stands": _ends("have the driver fill in the pose", hides=("frozen",)),
+    "static": _ends("choose another topic with --odom, or drive"),
+    "units": _ends(_DRIVER, hides=("other_publisher", "odometry_gap", "jump", "late", "twist_scale")),
+    "no_orientation_of_odometry": _ends("have the driver fill in the orientation of the pose"),
+    "odometry_jumps": _checked(
+        "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s"
+    ),
+    "odometry_reset": _checked("cut the recording there"),
+    "corrected": _checked(_WHEELS),
+    "not_planar": _checked(_SPACE),
+    "twist_scale": _checked(_DENSITY),
+    "twist_frame": _checked(_DENSITY),
+    "twist_unrelated": _checked(_DENSITY),
+    "covariance_negative": _checked(_DENSITY),
+    "covariance_tiny": _checked(_DENSITY, hides=_OF_A_PATH),
+    "covariance_useless": _checked(_DENSITY),
+    # -- fixes and headings
+    "fix_mirrored": _checked("correct its driver (REP 103: east, north, up)"),
+    "fix_frozen": _checked("have its driver send nothing while it has no fix"),
+    "fix_jumps": _checked("mend its covariance, or set INPUT.sigma_m; a run leaves out what contradicts"),
+    "heading_clockwise": _checked("correct its driver (REP 103: counter-clockwise from east)"),
+    "heading_offset": _checked("correct its driver (0 is east), or where it is mounted"),
+    # -- a gyro that is used as part of odometry
+    "gyro_scale": _checked(
+        "correct its driver (rad/s) or transform, or set odometry.turn_factor, INPUT.mount or INPUT.use=none",
+        hides=(*_OF_A_PATH, "clock_offset"),
+    ),
+    "gyro_bias": _checked("let the robot stand when its gyro starts; or set gyro.bias_sigma"),
+    "gyro_unrelated": _checked("check its topic, its frame and its clock"),
+    # -- sightings and odometry
+    "mirrored": _ends(_DRIVER, hides=("twist_unrelated", "twist_frame")),
+    "axes": _ends("correct the sensor's transform, or its frame"),
+    "unrelated": _ends("check the topic, the ids and the units of both"),
+    "id_twice": _checked(_ID, hides=("id_conflict",)),
+    "noise_zero": _ends("correct the driver; or set INPUT.noise=sigmas with INPUT.sigma_m"),
+    "seen_once": _checked(_NO_ID, hides=("no_closure", "no_parallax", "not_observable", "not_seen_again")),
+    "no_closure": _checked(
+        "record a drive with a loop; where there was one, ids change: let each landmark have its own"
+    ),
+    "no_parallax": _checked("record a drive past landmarks, with turns in sight of them"),
+    # -- a replay in memory, and a fit that begins at its estimate
+    "clock_offset": _checked(f"set INPUT.offset_s; {_ONE_CLOCK}", hides=("latency", *_OF_FIT)),
+    "mount_place": _checked("measure it, and correct its transform; or set INPUT.mount_correction", hides=_OF_FIT),
+    "mount_moved": _checked(
+        "fix the sensor on the robot, and cut the recording where it moved", hides=(*_OF_A_PATH, *_OF_FIT)
+    ),
+    "mount_yaw": _checked("correct its transform, or set INPUT.mount_correction", hides=_OF_FIT),
+    "odometry_scale": _ends("measure a way, and correct the wheel radius, or the size of the tags", hides=_OF_FIT),
+    "turn_scale": _checked("correct the track width, or set odometry.turn_factor", hides=_OF_FIT),
+    "range_scale": _ends(
+        "correct the tags' size, the sensor's driver, or odometry: a measured way tells", hides=_OF_FIT
+    ),
+    "not_observable": _checked("drive what the text names"),
+    "over_confident": _checked(
+        "correct its noise: INPUT.noise=sigmas with INPUT.sigma_m; robust.noise_scale=estimated (the default) allows "
+        "for 3 times"
+    ),
+    "odometry_over_confident": _checked(
+        "state it (odometry.noise); robust.noise_scale=estimated (the default) allows for it", hides=_OF_FIT
+    ),
+    "odometry_slips": _checked(
+        "look at ground and tyres there; a run finds slips (odometry.doubt); a gyro helps in turns"
+    ),
+    "id_reused": _checked(_ID),
+    "ids_unsure": _checked(_NO_ID),
+    "ids_exchanged": _checked(_ID),
+    "ids_renewed": _checked(_NO_ID),
+    "landmark_moves": _checked(
+        "let the detector leave out this id; a run believes no sighting of it that contradicts others"
+    ),
+    "landmark_moved": _checked("use landmarks that nobody moves"),
+    "map_breaks": _checked("find out whether the robot was carried or slipped"),
+    "outliers": _checked("correct the detector, or set landmarks.loss"),
+    "fit_unsure": _checked("mend what else is found, or ids and the mount"),
+    "silent": _checked("record a drive past landmarks all the way"),
+}
+"""What ``check`` finds, beyond counters."""
 
-def explain(reason: str) -> Reason:
-    """The row of a reason. Errors of the program are counted by their type and share one row."""
-    return REASONS.get(reason, REASONS["fault"])
+OF_RUNS: dict[str, Row] = {
+    "solve_failed": _checked("distances or noise that no robot has: --set INPUT.max_distance_m=... INPUT.noise=sigmas"),
+    "not_converged": _checked(
+        "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that "
+        "are believed contradict each other: graph_slam explain RUN lists those that fit worst"
+    ),
+    "contradictory": _checked("measurements contradict each other: graph_slam explain RUN says which"),
+    "contradicted": _checked(
+        "graph_slam explain RUN says why. Check units (metres and radians), signs (y and bearings to the left), the "
+        "place of the sensor (TF or INPUT.mount), its clock (INPUT.offset_s) and ids that are used twice. If only its "
+        "noise is larger than stated: --set INPUT.noise=sigmas --set INPUT.sigma_m=..."
+    ),
+    "contested": _checked("did it move, or is its id used twice?"),
+    "unused": _checked(""),
+    "not_seen_again": _checked(_NO_ID),
+    "confused": _checked(
+        "a density that is that of the landmarks, e.g. if they are 2 m apart --set landmarks.density_per_m=0.4; "
+        "classes, sizes or ids"
+    ),
+    "ambiguous": _checked("graph_slam explain RUN"),
+    "sides_unknown": _checked("more turns in sight of them, bearings, or surveyed landmarks (landmarks.surveyed)"),
+    "visits_contradict": _checked("compare with --set map.condense=false; graph_slam check BAG; map.window_keyframes"),
+    "elsewhere": _checked("check ids, units and clocks (graph_slam check BAG)"),
+    "odometry_alone": _checked("graph_slam check BAG says what of the recording cannot be used"),
+    "noise_too_large": _checked("--set INPUT.noise=sigmas --set INPUT.sigma_m=..."),
+}
+"""What the end of a run finds beyond these, and the node while it goes on."""
+
+TABLE = COUNTED | CHECKED | OF_RUNS
 
 
-def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return a line for each repair that the user can avoid, from counts by source and reason."""
-    return [
-        f"{source}: {times} times, {explain(reason).meaning}; mend it by {remedy(source, reason)}"
-        for source, by_reason in counts.items()
-        for reason, times in by_reason.items()
-        if explain(reason).effect is Effect.REPAIRED and remedy(source, reason)
-    ]
+def explain(code: str) -> Row:
+    """The row of a code. Errors of the program are counted by their type and share one row."""
+    return TABLE.get(code, COUNTED["fault"])
 
 
-def remedy(source: str, reason: str) -> str:
+def remedy(source: str, code: str) -> str:
     """Return the remedy for this input; empty if nothing is to be done."""
-    if source in ("tf", "tf_static") and reason == "frame_empty":  # no parameter names the frames of a transform
+    if source in ("tf", "tf_static") and code == "frame_empty":  # no parameter names the frames of a transform
         return "have the node that publishes the transform name both frames (header.frame_id and child_frame_id)"
-    return explain(reason).remedy.replace("INPUT", source.partition("#")[0])  # a second odometry of the topic is odom#2
+    return explain(code).remedy.replace("INPUT", source.partition("#")[0] or "INPUT")  # a second odometry is odom#2
