@@ -147,7 +147,7 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
-def _is_far_off(fit: TrialFit, one: answers.Finding, step_s: float) -> bool:
+def _is_far_off(fit: TrialFit, one: answers.Fitted, step_s: float) -> bool:
     """Return whether a parameter is far off by its limit and several sigmas. Between two poses a clock is no proof."""
     limit = max(_LIMITS.get(one.parameter.name, ("", np.inf))[1], _OF_STEP * step_s * (one.parameter.name == "clock"))
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
@@ -155,7 +155,7 @@ def _is_far_off(fit: TrialFit, one: answers.Finding, step_s: float) -> bool:
 
 
 def _fitted(
-    c: Columns, view: MapView, fit: TrialFit, one: answers.Finding, off: Mapping[Parameter, float]
+    c: Columns, view: MapView, fit: TrialFit, one: answers.Fitted, off: Mapping[Parameter, float]
 ) -> Iterator[Finding]:
     topic = c.topic_of(one.parameter.source)
     if one.parameter.name not in _LIMITS or topic is None:

@@ -23,8 +23,7 @@ from graph_slam_ros.runs.replay import Progress, RecordedRuns
 from graph_slam_ros.runs.suggestion import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView
-from graph_slam_ros.slam.calibration.answers import CODES, setting_of
-from graph_slam_ros.slam.calibration.answers import Finding as Fitted
+from graph_slam_ros.slam.calibration.answers import CODES, Fitted, setting_of
 from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS, Parameter, parameters_of
 from graph_slam_ros.slam.trial_fits import FIRST_DUE
 from graph_slam_ros.warmup import warmup

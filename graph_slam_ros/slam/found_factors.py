@@ -11,7 +11,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.answers import SIGMAS, Finding
+from graph_slam_ros.slam.calibration.answers import SIGMAS, Fitted
 from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
@@ -46,7 +46,7 @@ class FoundFactors:
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
         self._origins, self._anonymous = landmarks.map.origins, landmarks.anonymous
-        self.corrected: list[Finding] = []
+        self.corrected: list[Fitted] = []
         self._is_new = not start.keyframe_count
         frontend.corrections.restore(start.calibration)
         self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.hindsight.found_scales
@@ -66,11 +66,11 @@ class FoundFactors:
         (source,) = sources
         names = [name for name in scales if name != "turn" or not self._config.gyro_input]  # its turn is the gyro's
         before = self._frontend.corrections.found
-        used = list[Finding]()
+        used = list[Fitted]()
         for name in names:
             one, (value, sigma) = Parameter(source, name), scales[name]
             if _is_used(one, value, sigma, is_corrected=(source, name) in before):
-                used.append(Finding.of(one, value, sigma, "admitted", "{}"))
+                used.append(Fitted.of(one, value, sigma, "admitted", "{}"))
         # Six digits, because the last ones of a sine depend on the memory alignment of an array.
         values = {one.parameter: float(f"{one.value:.6g}") for one in used}
         report = self._correct(model, values, everything) if values else None

@@ -13,7 +13,7 @@ from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.measurements.types import Value
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.answers import Finding
+from graph_slam_ros.slam.calibration.answers import Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.doubt.detector import OdometryDoubt
@@ -220,7 +220,7 @@ class MapView:
 
     def trial_fit(
         self, groups: Sequence[str] = (AUTO,), *, is_to_correct: bool = False
-    ) -> tuple[TrialFit, list[Finding]]:
+    ) -> tuple[TrialFit, list[Fitted]]:
         """Fit the calibration of odometry and sensors with the map, on a copy: nothing is changed.
 
         Parameters
@@ -242,7 +242,7 @@ class MapView:
         """
         return self._trials.fit(groups, is_to_correct=is_to_correct)
 
-    def uncorrected(self) -> list[Finding]:
+    def uncorrected(self) -> list[Fitted]:
         """A clock, a mount or a scale that is off by so much that the poses are worse than their covariances say.
 
         A trial fit finds it, on a copy: nothing is changed.
@@ -250,7 +250,7 @@ class MapView:
         return self._trials.uncorrected() if self.is_solved else []
 
     @property
-    def uncorrected_so_far(self) -> Sequence[Finding]:
+    def uncorrected_so_far(self) -> Sequence[Fitted]:
         """The same of the last trial fit in the background."""
         return self._trials.uncorrected_so_far()
 
@@ -288,7 +288,7 @@ class MapView:
         return self._frontend.corrections.lines()
 
     @property
-    def corrected(self) -> Sequence[Finding]:
+    def corrected(self) -> Sequence[Fitted]:
         """The findings of these factors, in order."""
         return self._found_factors.corrected
 

@@ -21,7 +21,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded
-from graph_slam_ros.slam.calibration.answers import Finding, decide, is_off, jumps, uncorrected
+from graph_slam_ros.slam.calibration.answers import Fitted, decide, is_off, jumps, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
@@ -73,8 +73,8 @@ class TrialFits:
         self._of_window = Background[Fits | None](_SOURCE, executor, _DONE_IN, counters)  # before anything is condensed
         self._fits: Fits | None = None
         self._contradicting: TrialFit | None = None
-        self._so_far: tuple[Fits | None, list[Finding]] = (None, [])  # what the newest outcome says
-        self._of_whole: list[Finding] = []  # what the trial of the first window found
+        self._so_far: tuple[Fits | None, list[Fitted]] = (None, [])  # what the newest outcome says
+        self._of_whole: list[Fitted] = []  # what the trial of the first window found
         self._of_edges = -1  # the map that the newest trial of everything was of
 
     # -- trials ------------------------------------------------------------------------------------------------------
@@ -130,7 +130,7 @@ class TrialFits:
             slips=self._kidnaps.slipped(),
         )
 
-    def fit(self, groups: Sequence[str], *, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
+    def fit(self, groups: Sequence[str], *, is_to_correct: bool) -> tuple[TrialFit, list[Fitted]]:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
         problem = self.problem()
         wanted = self._priors(problem, groups, has_gyro=is_to_correct)
@@ -144,7 +144,7 @@ class TrialFits:
         has_turn = not (has_gyro and self._config.gyro_input)
         return {one: one.quantity.prior for one in problem.parameters(groups) if one.name != "turn" or has_turn}
 
-    def _judged(self, found: TrialFit, *, are_factors_asked: bool = False) -> list[Finding]:
+    def _judged(self, found: TrialFit, *, are_factors_asked: bool = False) -> list[Fitted]:
         """The finding of each parameter."""
         known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
         is_unnamed = not self._first_keyframe and 2 * sum(known) > len(known)
@@ -194,20 +194,20 @@ class TrialFits:
             if one not in doubted
         ]
 
-    def uncorrected(self) -> list[Finding]:
+    def uncorrected(self) -> list[Fitted]:
         """Return what is wrong in the map as it is now."""
         self._compute()
         is_newest = self._of_edges == self._graph.edge_ids.next
         fits = self._fits if is_newest else guarded(self._counters, _SOURCE, lambda: self._frozen()(CancelToken()))
         return self._with_whole(self._off(fits))
 
-    def _with_whole(self, now: list[Finding]) -> list[Finding]:
+    def _with_whole(self, now: list[Fitted]) -> list[Fitted]:
         """Add what was found before anything was condensed, and the window that is left does not show."""
         known = {(one.code, one.parameter.source) for one in now}
         whole = self._of_whole * bool(self._frontend.path.keyframes.first)
         return now + [one for one in whole if (one.code, one.parameter.source) not in known]
 
-    def uncorrected_so_far(self) -> Sequence[Finding]:
+    def uncorrected_so_far(self) -> Sequence[Fitted]:
         """Return what was wrong in the map at the newest trial."""
         if self._solver.is_current:
             self._compute()
@@ -228,7 +228,7 @@ class TrialFits:
             is_wrong = chosen.doubted or any(jumps(chosen)) or any(is_off(chosen, one) for one in self._judged(chosen))
             self._contradicting = whole if is_wrong else None
 
-    def _off(self, fits: Fits | None) -> list[Finding]:
+    def _off(self, fits: Fits | None) -> list[Fitted]:
         if fits is None or not self._solver.is_current:
             return []
         keyframes, total = self._frontend.path.keyframes.ids, self._frontend.corrections.total

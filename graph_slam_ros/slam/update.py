@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from graph_slam_ros.slam.bounded_map import Condensation
-from graph_slam_ros.slam.calibration.answers import Finding
+from graph_slam_ros.slam.calibration.answers import Fitted
 from graph_slam_ros.slam.doubt.record import Doubt
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
@@ -37,7 +37,7 @@ class Update:
     correction: Correction = _NO_CORRECTION
     changes: tuple[VerdictChange, ...] = ()
     alarms: tuple[Doubt, ...] = ()
-    calibrated: tuple[Finding, ...] = ()
+    calibrated: tuple[Fitted, ...] = ()
     condensed: Condensation | None = None
 
     def __bool__(self) -> bool:

@@ -50,7 +50,7 @@ Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_repro
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Fitted:
     """What a trial fit finds of one parameter.
 
     Attributes
@@ -72,7 +72,7 @@ class Finding:
     setting: tuple[str, Any] | tuple[()] = ()
 
     @classmethod
-    def of(cls, parameter: Parameter, value: float, sigma: float, verdict: Verdict, text: str) -> "Finding":
+    def of(cls, parameter: Parameter, value: float, sigma: float, verdict: Verdict, text: str) -> "Fitted":
         """Make a finding; ``{}`` in its text is the value with its sigma."""
         shown = text.replace("{}", parameter.with_sigma(value, sigma))
         return cls(parameter, value, sigma, verdict, f"{parameter}: {shown}")
@@ -100,7 +100,7 @@ def decide(
     slides: tuple[float, float] = (0.0, 0.0),
     sigma_per_m: float = 1.0,
     is_unnamed: bool = False,
-) -> list[Finding]:
+) -> list[Fitted]:
     """Answer the four questions for each parameter of a trial fit.
 
     Parameters
@@ -114,12 +114,12 @@ def decide(
     for k, one in enumerate(found.parameters):
         if one in found.doubted and not void:
             value, sigma, why = found.doubted[one]
-            out.append(Finding.of(one, value, sigma, "not_separable", f"not sure ({{}}): {why}"))
+            out.append(Fitted.of(one, value, sigma, "not_separable", f"not sure ({{}}): {why}"))
             continue
         stands = math.isinf(sigma_per_m) and one.name in _OF_MOTION
         why = void or (f"odometry does not move: {one.quantity.manoeuvre}" if stands else "")
         verdict, text = _verdict(found, k, why, _slides(one, slides) or (_unnamed(one) if is_unnamed else ""))
-        out.append(Finding.of(one, float(found.values[k]), float(found.sigmas[k]), verdict, text))
+        out.append(Fitted.of(one, float(found.values[k]), float(found.sigmas[k]), verdict, text))
     return out
 
 
@@ -238,11 +238,11 @@ Total = Callable[[str, str], float]
 
 def uncorrected(
     found: TrialFit,
-    findings: Sequence[Finding],
+    findings: Sequence[Fitted],
     covariances: Mapping[int, Array],
     total: Total,
     sigma_per_m: float,
-) -> list[Finding]:
+) -> list[Fitted]:
     """Return what is off by more than the poses' sigmas allow, the worst first.
 
     Findings are of each parameter, covariances (dof, dof) of poses by vertex, ``sigma_per_m`` is that of odometry.
@@ -261,15 +261,15 @@ def uncorrected(
     return [*(one for one, _ in jumps(found)), *sorted(out, key=lambda one: -one.shift)]
 
 
-def off_by(found: TrialFit, one: Parameter, values: Values, total: Total, *, may_be_ranges: bool = True) -> Finding:
+def off_by(found: TrialFit, one: Parameter, values: Values, total: Total, *, may_be_ranges: bool = True) -> Fitted:
     """Return what a parameter is off by, and the setting that mends it with others that are off, too."""
     value, sigma = values[one], found.sigma(one)
     setting = () if one in found.doubted else setting_of(one, values, total)
     ranges = _ranges_instead(found, value, total, setting) if may_be_ranges and one.name == "distance" else ""
-    return Finding(one, value, sigma, "admitted", _sentence(one, value, sigma, ranges), CODES[one.name], 0.0, setting)
+    return Fitted(one, value, sigma, "admitted", _sentence(one, value, sigma, ranges), CODES[one.name], 0.0, setting)
 
 
-def is_off(found: TrialFit, one: Finding) -> bool:
+def is_off(found: TrialFit, one: Fitted) -> bool:
     """Return whether a parameter is off beyond doubt, though its sigma may be too large to correct it."""
     name, far, limit = one.parameter.name, abs(one.value), max(SIGMAS * one.sigma, BESIDE_BENDS)
     is_known = one.verdict == "admitted" or (one.verdict == "not_determined" and is_certain(found, one.parameter))
@@ -282,7 +282,7 @@ def _has_bends(found: TrialFit) -> bool:
     return any(one.name == BEND for one in found.doubted)
 
 
-def jumps(found: TrialFit) -> Iterator[tuple[Finding, float]]:
+def jumps(found: TrialFit) -> Iterator[tuple[Fitted, float]]:
     """Yield what is another one later in the drive, a clock or an angle of a mount, with the limit."""
     for k, one in enumerate(found.parameters if found.lost <= MOST_LOST else ()):
         (before, after), sigma = (float(half[k]) for half in found.halves), float(2.0 * found.covariance[k, k]) ** 0.5
@@ -298,7 +298,7 @@ def jumps(found: TrialFit) -> Iterator[tuple[Finding, float]]:
             else:
                 turned = f"its sensor is turned by {one.shown(before)} {_AXIS[one.name]}on the robot"
                 code, text = "mount_moved", f"{turned} {then}: it was knocked, or is loose"
-            yield Finding(one, after - before, sigma, "not_reproducible", text, code), limit
+            yield Fitted(one, after - before, sigma, "not_reproducible", text, code), limit
 
 
 def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:
@@ -314,7 +314,7 @@ def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:
     return np.asarray(np.sqrt(np.maximum(square, 0.0).mean(axis=0) / every.shape[1]))
 
 
-def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Finding]:
+def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Fitted]:
     """Odometry whose noise is so small that the fit of its factors is not believed, if it matters."""
     far = np.abs(found.values) > SIGMAS * found.sigmas
     of_odometry = [k for k, one in enumerate(found.parameters) if one.name in OF_ODOMETRY and far[k]]
@@ -323,7 +323,7 @@ def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Findin
         return []
     text = f"odometry states {sigma_per_m:.1g} m of noise for each metre, no wheels are so good"
     more = "odometry_over_confident", float(shifts[worst]), ("odometry.noise", "motion")
-    return [Finding(found.parameters[worst], sigma_per_m, 0.0, "refused", text, *more)]
+    return [Fitted(found.parameters[worst], sigma_per_m, 0.0, "refused", text, *more)]
 
 
 def _ranges_instead(found: TrialFit, distance: float, total: Total, setting: tuple[str, Any] | tuple[()]) -> str:
