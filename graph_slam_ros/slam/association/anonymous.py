@@ -17,7 +17,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
 from graph_slam_ros.slam.association.assignments import Assigned, Assignments
-from graph_slam_ros.slam.association.beam import NOTHING, Beam, BeamSettings, Decision, changes
+from graph_slam_ros.slam.association.beam import NOTHING, Beam, BeamSettings
 from graph_slam_ros.slam.association.belief import SolverBelief
 from graph_slam_ros.slam.association.elsewhere import Elsewhere
 from graph_slam_ros.slam.association.hindsight import Found, FrozenScans, Hindsight
@@ -72,7 +72,6 @@ class AnonymousLandmarks:
         self.hindsight = Hindsight(config, self._settings, executor, counters)
         self.clusters = Assignments(landmarks, counters, backend)
         self._beam: Beam | None = None
-        self._leader: Decision | None = None
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._compared = 0  # scans
         self.rejoins = frozenset[int]()
@@ -95,7 +94,7 @@ class AnonymousLandmarks:
 
     def forget_belief(self) -> None:
         """Restart the beam from the solver's estimate, because the map has moved."""
-        self._beam = self._leader = None
+        self._beam = None
 
     def rescale(self, factors: tuple[float, float]) -> None:
         """Take over that odometry's distance and turn were multiplied."""
@@ -135,30 +134,28 @@ class AnonymousLandmarks:
         first = self.clusters.append(scan.clusters)
         motion = self._history.append(scan, first)
         try:
-            now = self._explained(scan, first, motion)
+            changed = self._explained(scan, first, motion)
         except (GraphSlamError, np.linalg.LinAlgError):  # no covariance now: the solve that failed is counted
-            self._beam = self._leader = now = None
-        changed = {c: self._same.get(k, k) for c, k in changes(self._leader, now).items()}
-        self._leader = now
+            self._beam, changed = None, {}
         self.clusters.give({c: landmark for c, landmark in changed.items() if c < first})
         return self.clusters.begin(first, changed)
 
-    def _explained(self, scan: Scan, first: int, motion: Motion | None) -> Decision | None:
-        """Explain the scan after a motion. Returns the leader's last decision."""
+    def _explained(self, scan: Scan, first: int, motion: Motion | None) -> dict[int, int]:
+        """Explain the scan after a motion. Returns the landmarks of its clusters, and of others that have changed."""
         self._backend.hand_over()
         beam, names = self._beam, self.clusters.names
         if beam is None or motion is None or motion.is_broken:
             scales, sigma = self.hindsight.scales
-            seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
-            beam, self._leader = Beam(self._settings, seed), None
+            scales = scales if beam is None else beam.scales[0]
+            beam = self._belief.begin(self._settings, scan, names, scales, sigma)
         else:
             beam.advance(motion)
             self._belief.recall(beam, scan, names)
-        decision = beam.explain(scan, first)
+        changed = beam.explain(scan, first)
         if not beam.is_sound:
             raise GraphSlamError("the hypotheses are not finite")
         self._beam = beam
-        return decision
+        return {c: self._same.get(landmark, landmark) for c, landmark in changed.items()}
 
     def doubt(self, since_ns: int, added: Callable[[float], Array] | None) -> None:
         """Use odometry with more noise, or as stated again. In the first case the scans since then are explained anew.
@@ -203,17 +200,15 @@ class AnonymousLandmarks:
     def _explain_from(self, first: int) -> None:
         """Explain the scans anew from one on, by the map and the path as they are."""
         history = self._history
-        clusters = range(history.firsts[first], self.clusters.count)
+        changed = dict[int, int]()
         self.hindsight.restart()
-        self._beam = self._leader = now = None
+        self._beam = None
         try:
             for k in range(first, len(history.scans)):
-                motion = history.motions[k - 1] if k else None
-                now = self._explained(history.scans[k], history.firsts[k], motion)
-                self._leader = now
+                changed |= self._explained(history.scans[k], history.firsts[k], history.motions[k - 1] if k else None)
         except (GraphSlamError, np.linalg.LinAlgError):  # as when they were new
-            self._beam = self._leader = None
-        self.clusters.give({c: self._same.get(k, k) for c, k in changes(None, now).items() if c in clusters})
+            self._beam = None
+        self.clusters.give(changed)
 
     # -- keyframes leave ---------------------------------------------------------------------------------------------
 
@@ -239,8 +234,6 @@ class AnonymousLandmarks:
         history.forget(k)
         self.clusters.forget_before(first)
         self._compared -= k
-        if self._beam is not None:
-            self._beam.forget_before(first)
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 

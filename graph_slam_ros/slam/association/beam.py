@@ -6,6 +6,7 @@ another with the joint covariance, so that the assignments are jointly compatibl
 likeliest are kept. Of hypotheses with the same recent decisions only the best is kept. The first one is the leader.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ _FREE, _SLIPPED = -1, -9
 _UNLIKELY = 2.0  # log of how much less likely nothing is than something new
 _SLIP_LONGEST = 6.0
 _MORE_SLOTS = 8
+_REVISED = 500  # the newest clusters, whose landmarks may change
 
 Ids = NDArray[np.int64]
 
@@ -56,50 +58,6 @@ class BeamSettings:
     slip_sigma_rad: float = 0.3
 
 
-@dataclass(slots=True)
-class Decision:
-    """The landmark of a cluster, linked to the previous decision; ``count`` decisions in all."""
-
-    before: "Decision | None"
-    cluster: int
-    landmark: int
-    count: int = 1
-
-
-def changes(last: Decision | None, now: Decision | None) -> dict[int, int]:
-    """The decisions of one chain that differ from another's, as landmark by cluster."""
-    out: dict[int, int] = {}
-    while now is not last:
-        if last is None or (now is not None and now.count > last.count):
-            assert now is not None
-            out[now.cluster] = now.landmark
-            now = now.before
-        elif now is None or last.count > now.count:
-            last = last.before
-        else:
-            out[now.cluster] = now.landmark
-            now, last = now.before, last.before
-    return dict(sorted(out.items()))
-
-
-@dataclass(frozen=True, slots=True)
-class Seed:
-    """The start of a beam: position (n,), rotation (n, n), odometry's scales, landmarks (k, n) by number and class.
-
-    Attributes
-    ----------
-    covariance : (D, D) of position in map, rotation in the robot's frame, scales and landmarks
-    """
-
-    position: Array
-    turn: Array
-    scales: Array
-    landmarks: Array
-    numbers: Ids
-    sorts: list[str]
-    covariance: Array
-
-
 @dataclass(frozen=True, slots=True)
 class _Expected:
     log_likelihood: Array  # (K, L)
@@ -120,22 +78,39 @@ class Beam:
     sorts : (K, L) class of a landmark; empty where it has none
     covariance : (K, D, D) of position, rotation in the robot's frame, scales, landmarks
     last : (K, L) the scan in which a landmark was seen last
-    history : of each the last decision
+    decided : (K, C) the landmarks of the newest clusters
     """
 
-    def __init__(self, settings: BeamSettings, seed: Seed) -> None:
+    def __init__(
+        self,
+        settings: BeamSettings,
+        position: Array,
+        turn: Array,
+        scales: Array,
+        landmarks: Mapping[int, tuple[Array, str]],
+        covariance: Array,
+    ) -> None:
+        """Begin with one hypothesis.
+
+        Parameters
+        ----------
+        position, turn, scales : (n,), (n, n), (2,)
+        landmarks : place (n,) and class, by number
+        covariance : (D, D)
+        """
         self.settings = settings
-        self._n = n = len(seed.position)
+        self._n = n = len(position)
         self._r = 1 if n == 2 else 3
         self._base = n + self._r + 2
-        slots = len(seed.numbers)
-        self.position, self.turn = seed.position[None].copy(), seed.turn[None].copy()
-        self.scales, self.landmarks = seed.scales[None].copy(), seed.landmarks.reshape(1, slots, n).copy()
-        self.ids, self.last = seed.numbers.reshape(1, slots).copy(), np.zeros((1, slots), dtype=np.int64)
-        self.sorts = np.array(seed.sorts, dtype=object).reshape(1, slots)
-        self.covariance = seed.covariance[None].copy()
+        slots = len(landmarks)
+        self.position, self.turn, self.scales = position[None].copy(), turn[None].copy(), scales[None].copy()
+        self.landmarks = np.array([place for place, _ in landmarks.values()]).reshape(1, slots, n)
+        self.sorts = np.array([sort for _, sort in landmarks.values()], dtype=object).reshape(1, slots)
+        self.ids, self.last = np.array([list(landmarks)], dtype=np.int64), np.zeros((1, slots), dtype=np.int64)
+        self.covariance = covariance[None].copy()
         self.log_weight = np.zeros(1)
-        self.history: list[Decision | None] = [None]
+        self.decided = np.empty((1, 0), dtype=np.int64)
+        self._clusters: list[int] = []  # of its columns
         self._signs: list[tuple[int, ...]] = [()]
         self._scans, self._since_slip = 0, 0.0
 
@@ -149,27 +124,32 @@ class Beam:
             self._slip(self._since_slip)
             self._since_slip = 0.0
 
-    def explain(self, scan: Scan, first: int) -> Decision | None:
-        """Explain a scan. Returns the leader's last decision.
+    def explain(self, scan: Scan, first: int) -> dict[int, int]:
+        """Explain a scan. Returns the landmarks of its clusters by the leader, and of others where they have changed.
 
         Parameters
         ----------
         first : number of its first cluster; the others follow
         """
         self._scans += 1
-        used = np.empty((len(self.log_weight), 0), dtype=np.int64)
+        before, count = self._leader(), len(self._clusters)
         order = sorted(range(len(scan.clusters)), key=lambda k: float(np.linalg.norm(scan.clusters[k].point)))
         for k in order:
-            used = self._explain_cluster(scan.clusters[k], first + k, used)
+            self._explain_cluster(scan.clusters[k], first + k, self.decided[:, count:])
         self._keep(np.argsort(-self.log_weight, kind="stable")[: self.settings.hypotheses])
         self.log_weight -= self.log_weight[0]
         self.covariance = 0.5 * (self.covariance + self.covariance.transpose(0, 2, 1))
-        return self.history[0]
+        changed = {c: landmark for c, landmark in sorted(self._leader().items()) if before.get(c) != landmark}
+        self.decided, self._clusters = self.decided[:, -_REVISED:], self._clusters[-_REVISED:]
+        return changed
+
+    def _leader(self) -> dict[int, int]:
+        return dict(zip(self._clusters, self.decided[0].tolist(), strict=True))
 
     def _keep(self, which: Ids) -> None:
-        for name in ("position", "turn", "scales", "landmarks", "ids", "sorts", "last", "covariance", "log_weight"):
+        of_each = "position turn scales landmarks ids sorts last covariance log_weight decided"
+        for name in of_each.split():
             setattr(self, name, getattr(self, name)[which])
-        self.history = [self.history[i] for i in which.tolist()]
         self._signs = [self._signs[i] for i in which.tolist()]
 
     def _predict(self, m: Motion) -> None:
@@ -206,8 +186,8 @@ class Beam:
 
     # -- a cluster ---------------------------------------------------------------------------------------------------
 
-    def _explain_cluster(self, cluster: Cluster, number: int, used: Ids) -> Ids:
-        """Branch over the landmarks of a cluster. Takes and returns what each hypothesis has used in this scan."""
+    def _explain_cluster(self, cluster: Cluster, number: int, used: Ids) -> None:
+        """Branch over the landmarks of a cluster, but for those (K, m) that each hypothesis has used in this scan."""
         c, slots = self.settings, self.ids.shape[1]
         what = self._expect(cluster)
         fits = what.log_likelihood
@@ -226,17 +206,13 @@ class Beam:
                 kept.append((i, option, name))
                 if len(kept) == c.hypotheses:
                     break
-        source = np.array([i for i, _, _ in kept])
+        source, options, names = np.array(kept).T
         self._keep(source)
         self.log_weight, self._signs = np.array(list(signs.values())), list(signs)
-        self.history = [
-            Decision(h, number, name, h.count + 1 if h else 1)
-            for h, (_, _, name) in zip(self.history, kept, strict=True)
-        ]
-        options = np.array([option for _, option, _ in kept])
+        self.decided = np.column_stack([self.decided, names])
+        self._clusters.append(number)
         self._update(source, options, what)
         self._begin(np.flatnonzero(options == slots), cluster, number)
-        return np.column_stack([used[source], [name for _, _, name in kept]])
 
     def _expect(self, cluster: Cluster) -> _Expected:
         """Predict all landmarks in all hypotheses: the likelihood of the cluster, and the terms of an update."""
@@ -309,16 +285,6 @@ class Beam:
         slot = self._slots_for(which)
         whole = np.pad(rows, ((0, 0), (0, 0), (0, self.covariance.shape[1] - rows.shape[2])))
         self._place(which, slot, points, whole, own, number, sort)
-
-    def forget_before(self, cluster: int) -> None:
-        """Forget the decisions on clusters before a number. Hypotheses share what they decided long ago."""
-        done = set[int]()
-        for one in self.history:
-            while one is not None and id(one) not in done:
-                done.add(id(one))
-                if one.before is not None and one.before.cluster < cluster:
-                    one.before = None
-                one = one.before
 
     @property
     def is_sound(self) -> bool:

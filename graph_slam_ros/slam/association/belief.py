@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.association.beam import Beam, Ids, Seed
+from graph_slam_ros.slam.association.beam import Beam, BeamSettings, Ids
 from graph_slam_ros.slam.association.scans import Scan
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation_vector
@@ -24,8 +24,10 @@ class SolverBelief:
     def __init__(self, space: Geometry, solver: Solver, landmarks: Landmarks) -> None:
         self._space, self._solver, self._landmarks = space, solver, landmarks
 
-    def seed(self, scan: Scan, names: Mapping[int, str], scales: Array, scale_sigma: float) -> Seed:
-        """The pose at a scan and the landmarks around it, with their joint covariance.
+    def begin(
+        self, settings: BeamSettings, scan: Scan, names: Mapping[int, str], scales: Array, scale_sigma: float
+    ) -> Beam:
+        """Begin a beam with the pose at a scan and the landmarks around it, and their joint covariance.
 
         Raises
         ------
@@ -46,8 +48,9 @@ class SolverBelief:
         whole = np.zeros((len(covariance) + 2,) * 2)
         whole[np.ix_(where, where)] = covariance
         whole[[dof, dof + 1], [dof, dof + 1]] = scale_sigma**2
-        sorts = [self._landmarks.known[names[k]].sort for k in numbers[near].tolist()]
-        return Seed(position, turn, scales, points[near], numbers[near], sorts, whole)
+        known = self._landmarks.known
+        marks = {k: (points[i], known[names[k]].sort) for i, k in zip(near, numbers[near].tolist(), strict=True)}
+        return Beam(settings, position, turn, scales, marks, whole)
 
     def recall(self, beam: Beam, scan: Scan, names: Mapping[int, str]) -> None:
         """Bring back landmarks of the map that the beam lacks, if something is seen near them."""

@@ -5,6 +5,7 @@ import pytest
 
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.association.beam import BeamSettings
 from graph_slam_ros.slam.association.belief import SolverBelief
 from graph_slam_ros.slam.association.scans import Cluster, Reckoned, Scan
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -92,9 +93,8 @@ def without_scales(covariance, dof):
 
 def test_a_beam_begins_with_the_joint_gaussian_of_the_whole_graph(drive):
     n, slam = drive
-    scan, names = a_scan(n, slam.view), {k: str(k) for k in range(len(MARKS))}
-    seed = belief_of(n, slam).seed(scan, names, np.zeros(2), SCALE_SIGMA)
-    dof = SPACES[n].dof
-    expected = dense(n, slam.view, scan, [names[k] for k in seed.numbers.tolist()])
-    assert without_scales(seed.covariance, dof) == pytest.approx(expected, rel=1e-5, abs=1e-9)
-    assert seed.covariance[dof : dof + 2] == pytest.approx(SCALE_SIGMA**2 * np.eye(len(seed.covariance))[dof : dof + 2])
+    scan, names, dof = a_scan(n, slam.view), {k: str(k) for k in range(len(MARKS))}, SPACES[n].dof
+    beam = belief_of(n, slam).begin(BeamSettings(10.0, 0.0), scan, names, np.zeros(2), SCALE_SIGMA)
+    covariance, known = beam.covariance[0], dense(n, slam.view, scan, [names[k] for k in beam.ids[0].tolist()])
+    assert without_scales(covariance, dof) == pytest.approx(known, rel=1e-5, abs=1e-9)
+    assert covariance[dof : dof + 2] == pytest.approx(SCALE_SIGMA**2 * np.eye(len(covariance))[dof : dof + 2])
