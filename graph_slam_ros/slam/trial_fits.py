@@ -21,7 +21,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded
-from graph_slam_ros.slam.calibration.answers import Fitted, decide, is_off, jumps, uncorrected
+from graph_slam_ros.slam.calibration.answers import Fitted, decide, is_off, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
@@ -225,7 +225,7 @@ class TrialFits:
         self._contradicting = None
         if self._fits is not None:
             chosen, whole = self._fits
-            is_wrong = chosen.doubted or any(jumps(chosen)) or any(is_off(chosen, one) for one in self._judged(chosen))
+            is_wrong = chosen.doubted or chosen.since_ns or any(is_off(chosen, one) for one in self._judged(chosen))
             self._contradicting = whole if is_wrong else None
 
     def _off(self, fits: Fits | None) -> list[Fitted]:
