@@ -16,7 +16,7 @@ from graph_slam_ros.slam.frontend.motion_compensation import as_matrix, axes_unk
 from graph_slam_ros.typing import Array, Numbers
 
 TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
-_UNCERTAIN_M, _UNCERTAIN_RAD = 1e3, 3.0
+_UNCERTAIN_M, _UNCERTAIN_RAD = 1e3, 3.0  # anywhere in a town, any heading
 _TILT_RAD = 0.3  # of odometry in space, whose z axis points up; positions do not tell it before the robot has moved
 
 

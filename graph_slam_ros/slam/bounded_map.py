@@ -99,12 +99,12 @@ class BoundedMap:
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
         anchor: Anchor,
-        kidnaps: OdometryDoubt,
+        doubt: OdometryDoubt,
         solution: Solution,
         counters: Counters,
     ) -> None:
         self._space, self._backend, self._frontend = frontend.config.space, backend, frontend
-        self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
+        self._landmarks, self._anchor, self._doubt = landmarks, anchor, doubt
         self._solution, self._counters = solution, counters
         self.state = backend.bounded
         self.condenser = Condenser(self._space, backend.solver, self.state)
@@ -238,7 +238,7 @@ class BoundedMap:
         self._note_accepted(out.edges)
         self._landmarks.forget_before(end)
         self._anchor.restore()
-        self._kidnaps.forget_before(int(self._frontend.path.keyframes.ids[0]))
+        self._doubt.forget_before(int(self._frontend.path.keyframes.ids[0]))
         self._solution.solve_rest()
         return out
 

@@ -1,8 +1,8 @@
 """The pipeline. Node, replay, tests and benchmarks all call ``GraphSlam.process``, its only entry.
 
 Measurements are put in order of stamp. Odometry becomes keyframes. Observations pass their gates, landmarks are
-associated, and both become edges. The edges are gated, a kidnap is detected, and everything is solved. The state is a
-function of the configuration and the sequence of accepted measurements, and of nothing else.
+associated, and both become edges. Edges are gated, odometry is doubted where it is contradicted, and all is solved. The
+state is a function of the configuration and the sequence of accepted measurements, and of nothing else.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -84,21 +84,21 @@ class GraphSlam:
         landmarks = LandmarkFrontend(config, backend, counters, executor)
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map))
         frontend = KeyframeFrontend(config, path, backend.noise, counters, backend.solver, start.datum)
-        kidnaps = OdometryDoubt(config, backend, counters, landmarks.anonymous, start)
+        doubt = OdometryDoubt(config, backend, counters, landmarks.anonymous, start)
         self._backend, self._frontend, self._landmarks = backend, frontend, landmarks
-        self._kidnaps, self._solution, self._anchor = kidnaps, solution, Anchor(config, backend)
+        self._doubt, self._solution, self._anchor = doubt, solution, Anchor(config, backend)
         self.settings = dict[str, Value]()
         self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
         found = FoundFactors(config, backend, frontend, landmarks, start)
         first = start.keyframe_count
-        trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
-        self.view = MapView(backend, frontend, landmarks, kidnaps, solution, trials, found, self.settings)
+        trials = TrialFits(config, backend, frontend, landmarks, doubt, counters, executor, first)
+        self.view = MapView(backend, frontend, landmarks, doubt, solution, trials, found, self.settings)
         if start.keyframes:
             self._restore(start)
-        bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
-        self._policies = Policies(backend, frontend, landmarks, kidnaps, trials, found, bounded, solution)
+        bounded = BoundedMap(backend, frontend, landmarks, self._anchor, doubt, solution, counters)
+        self._policies = Policies(backend, frontend, landmarks, doubt, trials, found, bounded, solution)
         self._updates, self.processed = UpdateLog(self.view), 0
 
     def __repr__(self) -> str:
@@ -169,7 +169,7 @@ class GraphSlam:
         begins_segment = frontend.begins_segment(step)
         self._use_reached(frontend.integrate(step))
         if begins_segment:
-            self._kidnaps.begin_segment(self.view.graph.vertex_ids.next, step.stamp_ns)
+            self._doubt.begin_segment(self.view.graph.vertex_ids.next, step.stamp_ns)
             if frontend.begin_segment(step):
                 self._solve()  # at the pose that was given
             self._solve_if_due()

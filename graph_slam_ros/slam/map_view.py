@@ -33,7 +33,7 @@ from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
-_LATELY_NS = 10_000_000_000
+_LATELY_NS = 10_000_000_000  # as long as health says that odometry is frozen
 
 
 class MapView:
@@ -49,14 +49,14 @@ class MapView:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        kidnaps: OdometryDoubt,
+        doubt: OdometryDoubt,
         solution: Solution,
         trials: TrialFits,
         found_factors: FoundFactors,
         settings: dict[str, Value],
     ) -> None:
         self.backend, self._frontend, self._landmarks = backend, frontend, landmarks
-        self._kidnaps, self._solution, self._settings = kidnaps, solution, settings
+        self._doubt, self._solution, self._settings = doubt, solution, settings
         self._trials, self._found_factors = trials, found_factors
 
     def __repr__(self) -> str:
@@ -403,15 +403,15 @@ class MapView:
     @property
     def alarms(self) -> tuple[Doubt, ...]:
         """The times when the landmarks contradicted odometry, in order: displacements and slips. Some may go on."""
-        return tuple(sorted(self._kidnaps.doubts, key=lambda one: one.began_ns))
+        return tuple(sorted(self._doubt.doubts, key=lambda one: one.began_ns))
 
     @property
     def displacements(self) -> list[dict[str, Any]]:
         """The same as records for files, each with its sentence; first those of the map that it began in."""
         own = [asdict(alarm) | {"text": str(alarm)} for alarm in self.alarms]
-        return [*self._kidnaps.earlier, *own]
+        return [*self._doubt.earlier, *own]
 
     @property
     def displaced(self) -> Doubt | None:
         """The alarm that goes on, a displacement before a slip; or None."""
-        return self._kidnaps.now
+        return self._doubt.now

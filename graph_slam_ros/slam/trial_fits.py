@@ -57,14 +57,14 @@ class TrialFits:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        kidnaps: OdometryDoubt,
+        doubt: OdometryDoubt,
         counters: Counters,
         executor: Executor,
         first_keyframe: int = 0,
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
         self._landmarks = landmarks.map
-        self._kidnaps, self._counters = kidnaps, counters
+        self._doubt, self._counters = doubt, counters
         self._graph, self._solver = backend.graph, backend.solver
         self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_ids.next
         self._due, self._due_slips = FIRST_DUE, _DOUBTS
@@ -127,7 +127,7 @@ class TrialFits:
             segments=tuple(dict.fromkeys(begins)),
             track=path.samples.track(rows.poses, factors),
             first_edge=max(self._backend.first_free_edge, self._first_edge),
-            slips=self._kidnaps.slipped(),
+            slips=self._doubt.slipped(),
         )
 
     def fit(self, groups: Sequence[str], *, is_to_correct: bool) -> tuple[TrialFit, list[Fitted]]:

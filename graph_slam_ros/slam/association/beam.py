@@ -20,8 +20,8 @@ NOTHING = -2
 """What a cluster is that is of no landmark."""
 _FREE, _SLIPPED = -1, -9
 _UNLIKELY = 2.0  # log of how much less likely nothing is than something new
-_SLIP_LONGEST = 6.0
-_MORE_SLOTS = 8
+_SLIP_LONGEST = 6.0  # times the interval of slips: a longer gap makes none likelier
+_MORE_SLOTS = 8  # landmarks by which a hypothesis grows at once
 _REVISED = 500  # the newest clusters, whose landmarks may change
 
 Ids = NDArray[np.int64]

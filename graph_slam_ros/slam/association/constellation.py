@@ -10,7 +10,7 @@ from graph_slam_ros.slam.landmarks.rotations import aligned, yaw
 from graph_slam_ros.typing import Array, Numbers
 
 _LEAST, _LEAST_APART_M = 4, 2.0  # points of a constellation, and how far two of them are apart
-_MOST_MOTIONS = 4000
+_MOST_MOTIONS = 4000  # bounds the time: an even sample of them
 _SAME_M, _SAME_RAD = 1.0, 0.3  # poses farther from each other are two
 _BY_CHANCE = 1e-4  # is enough for the displacement search, which decides
 

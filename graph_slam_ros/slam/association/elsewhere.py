@@ -27,7 +27,7 @@ _MISSING, _MISSING_LANDMARKS = 4, 2  # landmarks that should be seen and are not
 _MISSED_BY_CHANCE = 1e-5  # probability
 _SLIP = 0.5  # part of the way by which odometry may err: that is a slip
 _COMPARED = (6, 9, 12, 18, 24)  # newest scans that are compared with the whole map
-_MOST_GROUPS = 12
+_MOST_GROUPS = 12  # newest landmarks that are compared: bounds the time
 
 
 class Elsewhere:

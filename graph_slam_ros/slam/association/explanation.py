@@ -27,7 +27,7 @@ _HELD = 1e8  # information on the first pose
 _WEAK_PRIOR = 1e-6  # on a landmark
 _LOG_2_PI = float(np.log(2.0 * np.pi))
 _NEVER = 1e9  # the cost of a slip where none may be
-_DAMPED_AT_MOST = 1e6
+_DAMPED_AT_MOST = 1e6  # with more, a step moves nothing
 _MOST_WORK = 5_000_000  # rows that are linearised for moves: half a minute, ten times what 15 minutes of driving need
 
 

@@ -23,9 +23,9 @@ from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
 from graph_slam_ros.typing import Array, Mask, Numbers
 
-SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
+SCAN_NS, _SCAN_RAD = 500_000_000, 0.15  # of one scan: in it odometry errs by less than the clusters
 NEARBY_S = np.linspace(-0.5, 0.5, 21)
-NEARBY_NS = 500_000_000
+NEARBY_NS = 500_000_000  # the same as a stamp
 """Times relative to a scan's stamp, at which its motion by odometry is kept, for clocks that differ."""
 _CLOSE_M = 0.5  # objects of one message this close may be one: two poles of a group, or one of them seen twice
 _SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster

@@ -19,15 +19,15 @@ from graph_slam_ros.slam.landmarks.rotations import yaw
 from graph_slam_ros.typing import Array, Mask
 
 _SHORT_S, _WEAK = 100.0, 0.15  # a landmark that is seen for less, or in so small a part of the median's scans
-_GAP_S, _LONGEST_S = 5.0, 60.0
-_SAME_M, _LEAST_M = 0.6, 0.5
-_TRIES = 4
+_GAP_S, _LONGEST_S = 5.0, 60.0  # without a scan, in which odometry may err unseen; of a stretch around a landmark
+_SAME_M, _LEAST_M = 0.6, 0.5  # between distances of two pairs of landmarks that may be one; of a pair
+_TRIES = 4  # candidates that are solved completely
 _OTHER = 0.1  # part of the clusters by which two candidates differ
-_MOST_COST, _MOST_PRIOR, _NONE = 14.0, 30.0, 60.0
-_TURN_RAD, _MOVE_M = 0.3, 0.6
-_LEAST_CLUSTERS, _LEAST_STRONG = 3, 5
-_MOST_MOVES, _MOST_STRETCHES = 40, 16
-_MOST_LOCAL, _MOST_SCORED = 8, 200
+_MOST_COST, _MOST_PRIOR, _NONE = 14.0, 30.0, 60.0  # of a cluster, of a motion; chi2 of a cluster of no landmark
+_TURN_RAD, _MOVE_M = 0.3, 0.6  # sigmas of what odometry errs by in a gap
+_LEAST_CLUSTERS, _LEAST_STRONG = 3, 5  # of a stretch; scans of a landmark that it is laid on
+_MOST_MOVES, _MOST_STRETCHES = 40, 16  # bound the time, as the next two
+_MOST_LOCAL, _MOST_SCORED = 8, 200  # landmarks whose pairs make motions, and motions that are compared by all clusters
 _APART_M = 0.5  # explanations that have a stretch farther apart are two
 _HOPELESS = 60.0  # that much more than before is never mended by giving clusters to others
 

@@ -37,11 +37,11 @@ from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Parame
 from graph_slam_ros.slam.frontend.corrections import AXES
 from graph_slam_ros.typing import Array
 
-SIGMAS = 4.0
-MOST_CORRELATED = 0.95
-PRIOR_SIGMAS = 3.0
-MOST_LOST = 0.2
-LEAST_LANDMARKS = 3
+SIGMAS = 4.0  # 1 in 16,000 by chance, for each parameter
+MOST_CORRELATED = 0.95  # with more, noise decides which of two it is
+PRIOR_SIGMAS = 3.0  # more is another configuration, not an error of this one
+MOST_LOST = 0.2  # part of the sightings: with more, the fit is of what is left
+LEAST_LANDMARKS = 3  # two tell a pose, a third that it is right
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
 LEAST_SIGMA_PER_M = 1e-3  # of odometry: the noise of its position [m] for each metre
 _OF_MOTION = {"yaw": 0, "pitch": 1}  # angles that are measured against the motion, and the direction across it

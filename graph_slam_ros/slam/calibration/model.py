@@ -28,7 +28,7 @@ from graph_slam_ros.typing import Array, Index, Numbers
 
 _POINTS = ("landmark position", "tag position")
 
-_BEND_RAD = 0.1
+_BEND_RAD = 0.1  # of a step, at which half of the factor for bends counts
 _MOVED_M = 0.01  # of a step: with less, noise is not for its metres
 
 

@@ -24,7 +24,7 @@ from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.solver.linearization import Block, Losses, linearize
 from graph_slam_ros.typing import Array, Index
 
-_LEAST_KEYFRAMES = 3
+_LEAST_KEYFRAMES = 3  # fewer have no motion between motions
 _PROBE = 1e-4  # step of a numerical derivative
 
 

@@ -1,4 +1,4 @@
-"""Search for a displacement after a slip or a kidnap: the landmarks and odometry disagree on the pose.
+"""Search for a displacement: the landmarks and odometry disagree on the pose.
 
 Odometry that is wrong without a jump leaves traces in the sightings that are held back: they agree with one another at
 another pose of the robot, and not with odometry. Sightings with wrong identities do not agree with one another. The

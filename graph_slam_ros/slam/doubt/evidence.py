@@ -26,9 +26,9 @@ LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to o
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
 _CAP = 0.9999  # an observation beyond this quantile does not fit
 _LINEAR_RAD = 0.1  # by which an observation turns the pose: beyond, it is linearised again
-_MOST_LINEARIZATIONS = 5
+_MOST_LINEARIZATIONS = 5  # of one observation
 _PRIOR_DOF = 20.0  # degrees of freedom that would say that odometry's noise is as stated
-_LARGEST = 3.0
+_LARGEST = 3.0  # as the noise that a run allows for
 _UNKNOWN, _KNOWN = 1.5, 1.2  # all noise may be larger by this factor, where it is not measured and where it is
 
 

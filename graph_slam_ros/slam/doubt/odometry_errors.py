@@ -17,7 +17,7 @@ from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
 
 _OBSERVED = 0.95  # largest eigenvalue of a direction that other measurements observe
-_LEAST = 1e-6
+_LEAST = 1e-6  # an eigenvalue below is rounding
 _NOISE_FACTOR = 1.5  # all noise may be larger than stated by this factor
 
 

@@ -50,10 +50,10 @@ from graph_slam_ros.solver.linearization import Losses, loss_weights
 from graph_slam_ros.typing import Array, Index
 
 ALIKE_NS = 2_000_000_000  # errors that are alike last less: a landmark not seen for so long is passed again
-LEAST_IN_PASS, LEAST_PASSES = 3, 10
+LEAST_IN_PASS, LEAST_PASSES = 3, 10  # sightings, and passes: of fewer no variance is told
 LEAST_DOF = 200.0  # of a group: below it says too little
 LEAST_DOF_OF_MOTION = 20.0  # of odometry, whose estimate changes the less the less is known
-MOST_OUTLIERS = 0.05
+MOST_OUTLIERS = 0.05  # part of a group: with more, its residuals are not those of noise
 LEAST_WEIGHT = 0.1  # by the loss: an edge with less is an outlier
 SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma
 _ROUNDING = 1e-6  # degrees of freedom, less of which are rounding: another processor has none

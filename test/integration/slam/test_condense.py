@@ -133,7 +133,7 @@ GOES_ON = {
     "a trial fit": (lambda slam: slam.view._trials._background.begin(lambda: lambda _: None, 0), True),
     "a search": (lambda slam: slam.view.backend._background.begin(lambda: lambda _: None, 0), False),
     "an alarm": (lambda slam: setattr(slam.view.backend, "holds_back", True), False),
-    "a slip": (lambda slam: slam._kidnaps.doubts.append(Doubt(0, 20.0, kind="rotation")), False),
+    "a slip": (lambda slam: slam._doubt.doubts.append(Doubt(0, 20.0, kind="rotation")), False),
     "an edge that is held back": (lambda slam: slam.view.backend._pending.append(7), False),
     "a solve that failed": (lambda slam: slam.restart(), False),
 }

@@ -274,13 +274,13 @@ def test_a_slip_that_was_none_is_taken_back_by_what_is_seen_next_and_leaves_no_t
     recording = world(3, laps=1)
     half = int(recording.stamps_ns[len(recording.stamps_ns) // 2])
     plain, doubted, links = GraphSlam(Config()), GraphSlam(Config()), None
-    window = doubted._kidnaps._window
+    window = doubted._doubt._window
     for m in measurements(recording):
         for slam in (plain, doubted):
             slam.process(m)
         if links is None and isinstance(m, Odometry) and m.stamp_ns > half:
             links = list(window.links.values())[-3:]
-            doubted._kidnaps._begin_slip("translation", links, 20.0, 2, m.stamp_ns)
+            doubted._doubt._begin_slip("translation", links, 20.0, 2, m.stamp_ns)
             assert "odometry in doubt since" in str(doubted.view.displaced)
             assert all(link.edge != link.own for link in links)
         if links is not None and doubted.view.displaced is None:
