@@ -187,7 +187,7 @@ def of_map(summary: Summary) -> Iterator[Finding]:
     for one in summary.get("uncorrected", ()):
         settings = tuple(f"{key}={value}" for key, value in one["settings"].items() if f"{key}=" not in one["text"])
         text = f"{one['text']} (graph_slam calibrate BAG compares the causes)"
-        yield Finding(one["code"], "error", text=text, settings=settings, remedy="")
+        yield Finding(one["code"], "error", text=text, settings=settings, remedy="" if one["settings"] else None)
     if (gyro := summary.get("gyro")) and gyro["state"] != "used":
         name, code, fault = gyro["name"], f"gyro_{gyro['state']}", GyroState(**gyro).fault
         note = Finding(code, "note", text=f"{name}: {explain(code).meaning}", source=name)

@@ -129,7 +129,7 @@ def test_a_sensor_that_was_knocked_is_told_and_since_when_though_odometry_was_in
     bag = planted(laps, tmp_path / "faulty.mcap", "knocked by 10 degrees half-way")
     assert main(["replay", str(bag), "--out", str(tmp_path / "run")]) == 3
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "mount_moved" in line]
-    assert "is turned by 0 deg on the robot at first, 10 deg since " in said
+    assert "is turned by 0 deg on the robot at first, 10 deg since " in said and "fix the sensor on the robot" in said
 
 
 def test_an_error_of_the_recording_makes_a_fit_meaningless():
