@@ -23,7 +23,7 @@ class Finding:
     code : its name, a row of the table
     severity : error: a replay fails or means nothing; warning: it is worse than it could be; note: good to know
     value, limit : what was measured, and from where on it is a finding, in ``unit``
-    text : what was measured, in one sentence
+    text : what was measured, in one sentence, or what the meaning of its row needs
     topic, first_ns, count : where: the topic, the first stamp (0: unknown), and how many messages or sightings
     settings : ``KEY=VALUE``, which together mend it; empty where no parameter does
     source : the input of the topic; empty where it is of none
@@ -47,12 +47,13 @@ class Finding:
 
     def __str__(self) -> str:
         mend = " ".join(f"--set {shlex.quote(text)}" for text in self.settings) or self.mend
-        return f"{self.text}{mend and ': '}{mend}"
+        meaning = explain(self.code).meaning
+        return f"{meaning.format(self) if '{' in meaning else self.text or meaning}{mend and ': '}{mend}"
 
     @property
     def mend(self) -> str:
         """Return what mends it beyond the settings, with the name of the input; empty where nothing is to be done."""
-        return remedy(self.source, self.code) if self.remedy is None else self.remedy
+        return remedy(self.source, self.code).format(self) if self.remedy is None else self.remedy
 
     @property
     def hides(self) -> tuple[str, ...]:

@@ -11,16 +11,12 @@ from functools import partial
 
 
 class Effect(Enum):
-    """The effect on a measurement."""
+    """The effect on a measurement: not used, used after a change, nothing is lost; or what is counted nowhere."""
 
     REFUSED = "refused"
-    """It is not used, and something is lost."""
     REPAIRED = "repaired"
-    """It is used after a change."""
     NOTED = "noted"
-    """Nothing is lost: a repetition, what the parameters ask for, or an event."""
     FOUND = "found"
-    """It is counted nowhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +25,8 @@ class Row:
 
     Attributes
     ----------
-    meaning : what has happened, in one sentence without a full stop; empty where the finding itself has it
+    meaning : what has happened, in one sentence without a full stop; empty where the finding itself has it; with
+        ``{0.value}`` and the like where it needs what the finding has
     remedy : what mends it, beyond the settings of a finding; ``INPUT`` is the name of the input; empty where nothing is
         to be done
     hides : codes that are no finding of their own beside it, because they follow from it
@@ -79,9 +76,7 @@ COUNTED: dict[str, Row] = {
     # -- stamps and order
     "bad_stamp": _refused("the stamp is negative, beyond 2^31 s, or has 1e9 ns or more", "correct the driver's stamps"),
     "zero_stamp": _refused("the stamp is zero", "have the driver fill in header.stamp"),
-    "late": _refused(
-        "it came after newer ones were used", "ordering.window_s (odometry), ordering.late_s; INPUT.offset_s"
-    ),
+    "late": _refused("newer ones were used before it", "ordering.window_s (odometry), ordering.late_s; INPUT.offset_s"),
     "future": _refused("the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
     "far_in_time": _refused("the transform is dated 10 s away from the others of its frame", "one clock for all /tf"),
     "before_jump": _refused("it was sent before the clock jumped back and arrived after"),
@@ -96,9 +91,7 @@ COUNTED: dict[str, Row] = {
     "lost_in_transport": _refused("the middleware lost it", "INPUT.reliability: reliable; net.core.rmem_max"),
     # -- frames
     "frame_slash_stripped": _repaired("the name of a frame began with a slash"),
-    "frame_empty": _refused(
-        "the message names no frame", "header.frame_id of its driver; or INPUT.frame", hides=("frame_unknown",)
-    ),
+    "frame_empty": _refused("it names no frame", "header.frame_id of its driver; or INPUT.frame", ("frame_unknown",)),
     "frame_in_itself": _refused("a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": _refused("no transform links the message's frame to the robot", _FRAMES),
     "transform_gaps": _refused("/tf links the message's frame to the robot, but not at its stamp", _GAPS),
@@ -135,9 +128,7 @@ COUNTED: dict[str, Row] = {
     "gyro_silent": _noted("the gyro was silent longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"),
     "gyro_doubted": _noted("it contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"),
     "no_angular_velocity": _refused("the IMU says that it has no angular velocity", "INPUT.use=fix"),
-    "jump": _noted(
-        "odometry jumped, a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
-    ),
+    "jump": _noted("odometry jumped: a new segment; of tf: map -> odom", "odometry.max_speed_m_s; tf.report_jump_m"),
     "other_publisher": _refused("it does not continue the odometry in use", _ONE_PUBLISHER),
     "reset_to_zero": _noted("odometry was set back to zero: a new segment begins"),
     # -- landmarks
@@ -176,7 +167,7 @@ COUNTED: dict[str, Row] = {
     "other_datum": _refused("the fix counts from another origin than the map", "the same INPUT.datum for all"),
     "thinned": _noted("its error is that of the one before", "INPUT.correlation_s; keyframes.max_interval_s"),
     "mount_unknown": _repaired(
-        "no transform has the position of the antenna on the robot: the base is assumed",
+        "no transform has the place of the antenna: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
     ),
     "mount_assumed": _noted("no transform has the place of the sensor: the base is assumed", _FRAMES),
@@ -190,7 +181,7 @@ COUNTED: dict[str, Row] = {
     "no_result": _refused("a closure has no result with a pose", "correct the publisher"),
     "within_one_keyframe": _refused("a closure links two moments of one keyframe: it says nothing new"),
     "from_where_there_was_no_odometry": _refused(
-        "the earlier stamp of a closure is outside the odometry", "stamps by the robot's clock"
+        "its earlier stamp is outside odometry", "stamps by the robot's clock"
     ),
     "from_condensed_keyframe": _refused("its start left the map", "map.condense=false"),
     # -- the map
@@ -211,9 +202,7 @@ COUNTED: dict[str, Row] = {
     "displaced": _noted("landmarks showed the robot elsewhere: carried, or slipped", "graph_slam explain RUN"),
     "slip": _noted("landmarks contradicted odometry for seconds: it counts less", "graph_slam check; odometry.noise"),
     "slip_taken_back": _noted("a slip was decided, and later sightings agree with odometry"),
-    "displacement_taken_back": _noted(
-        "later sightings contradict a displacement", "one id for each landmark; graph_slam check"
-    ),
+    "displacement_taken_back": _noted("later sightings contradict a displacement", f"{_ID}; graph_slam check"),
     "new_while_elsewhere": _refused("an unknown landmark, while the robot's place is unknown", "give initialpose"),
     "quarantined": _refused("the solver works without these measurements only", "graph_slam explain RUN"),
     # -- the node and its solver
@@ -230,22 +219,15 @@ CHECKED: dict[str, Row] = {
     "no_odometry": _ends("record nav_msgs/Odometry, or odom -> base_link on /tf"),
     "no_landmarks": _checked("record a topic of landmarks"),
     "input_unused": _checked("record it as a type of docs/inputs.md, or name another topic with --odom or --landmarks"),
-    "damaged": _checked(
-        "copy it again, with all of its files, or record it again", hides=("no_closure", "silent", "gap")
-    ),
+    "damaged": _checked("copy all of its files again, or record it again", ("no_closure", "silent", "gap")),
     # -- times
-    "wrong_stamps": _ends(
-        "correct the driver: header.stamp has seconds, and nanoseconds of the second (0 to 999999999)", hides=OF_STAMPS
-    ),
+    "wrong_stamps": _ends("correct the driver: header.stamp has seconds and nanoseconds (0 to 999999999)", OF_STAMPS),
     "clock_domains": _checked(f"{_ONE_CLOCK}; or set INPUT.offset_s"),
     "latency": _checked(f"{_ONE_CLOCK}; or set INPUT.offset_s"),
     "clock_jump": _checked(f"{_ONE_CLOCK}; cut the recording there", hides=(*_OF_A_PATH, *_OF_FIT, "clock_offset")),
     "no_overlap": _ends(f"{_ONE_CLOCK}; or set INPUT.offset_s"),
     "odometry_short": _checked("record odometry from the beginning to the end; find out whether its driver stopped"),
-    "time_jump": _checked(
-        "cut the recording in two; time.on_jump sets what a run does at the step",
-        hides=("odometry_jumps", "corrected", "fit_unsure"),
-    ),
+    "time_jump": _checked("cut the recording in two; or time.on_jump", ("odometry_jumps", "corrected", "fit_unsure")),
     "constant_stamps": _ends("stamp each message when it is measured (header.stamp)", hides=OF_STAMPS),
     "coarse_stamps": _ends("stamp each message when it is measured, to the millisecond", hides=OF_STAMPS),
     "rounded_stamps": _checked("stamp each message when it is measured, to the millisecond"),
@@ -264,9 +246,7 @@ CHECKED: dict[str, Row] = {
     "static": _ends("choose another topic with --odom, or drive"),
     "units": _ends(_DRIVER, hides=("other_publisher", "odometry_gap", "jump", "late", "twist_scale")),
     "no_orientation_of_odometry": _ends("have the driver fill in the orientation of the pose"),
-    "odometry_jumps": _checked(
-        "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s"
-    ),
+    "odometry_jumps": _checked("correct the driver; a run begins a segment above odometry.max_speed_m_s"),
     "odometry_reset": _checked("cut the recording there"),
     "corrected": _checked(_WHEELS),
     "not_planar": _checked(_SPACE),
@@ -284,8 +264,7 @@ CHECKED: dict[str, Row] = {
     "heading_offset": _checked("correct its driver (0 is east), or where it is mounted"),
     # -- a gyro that is used as part of odometry
     "gyro_scale": _checked(
-        "correct its driver (rad/s) or transform, or set odometry.turn_factor, INPUT.mount or INPUT.use=none",
-        hides=(*_OF_A_PATH, "clock_offset"),
+        "correct its driver (rad/s) or transform; or odometry.turn_factor, INPUT.mount", (*_OF_A_PATH, "clock_offset")
     ),
     "gyro_bias": _checked("let the robot stand when its gyro starts; or set gyro.bias_sigma"),
     "gyro_unrelated": _checked("check its topic, its frame and its clock"),
@@ -296,40 +275,25 @@ CHECKED: dict[str, Row] = {
     "id_twice": _checked(_ID, hides=("id_conflict",)),
     "noise_zero": _ends("correct the driver; or set INPUT.noise=sigmas with INPUT.sigma_m"),
     "seen_once": _checked(_NO_ID, hides=("no_closure", "no_parallax", "not_observable", "not_seen_again")),
-    "no_closure": _checked(
-        "record a drive with a loop; where there was one, ids change: let each landmark have its own"
-    ),
+    "no_closure": _checked(f"record a drive with a loop; where there was one, ids change: {_ID}"),
     "no_parallax": _checked("record a drive past landmarks, with turns in sight of them"),
     # -- a replay in memory, and a fit that begins at its estimate
     "clock_offset": _checked(f"set INPUT.offset_s; {_ONE_CLOCK}", hides=("latency", *_OF_FIT)),
     "mount_place": _checked("measure it, and correct its transform; or set INPUT.mount_correction", hides=_OF_FIT),
-    "mount_moved": _checked(
-        "fix the sensor on the robot, and cut the recording where it moved", hides=(*_OF_A_PATH, *_OF_FIT)
-    ),
+    "mount_moved": _checked("fix the sensor on the robot, and cut the recording there", (*_OF_A_PATH, *_OF_FIT)),
     "mount_yaw": _checked("correct its transform, or set INPUT.mount_correction", hides=_OF_FIT),
     "odometry_scale": _ends("measure a way, and correct the wheel radius, or the size of the tags", hides=_OF_FIT),
     "turn_scale": _checked("correct the track width, or set odometry.turn_factor", hides=_OF_FIT),
-    "range_scale": _ends(
-        "correct the tags' size, the sensor's driver, or odometry: a measured way tells", hides=_OF_FIT
-    ),
+    "range_scale": _ends("measure a way, and correct the tags' size, the sensor's driver, or odometry", _OF_FIT),
     "not_observable": _checked("drive what the text names"),
-    "over_confident": _checked(
-        "correct its noise: INPUT.noise=sigmas with INPUT.sigma_m; robust.noise_scale=estimated (the default) allows "
-        "for 3 times"
-    ),
-    "odometry_over_confident": _checked(
-        "state it (odometry.noise); robust.noise_scale=estimated (the default) allows for it", hides=_OF_FIT
-    ),
-    "odometry_slips": _checked(
-        "look at ground and tyres there; a run finds slips (odometry.doubt); a gyro helps in turns"
-    ),
+    "over_confident": _checked("INPUT.noise=sigmas, INPUT.sigma_m; robust.noise_scale=estimated allows for 3 times"),
+    "odometry_over_confident": _checked("odometry.noise; robust.noise_scale=estimated allows for it", _OF_FIT),
+    "odometry_slips": _checked("look at ground and tyres there; odometry.doubt finds slips; a gyro helps in turns"),
     "id_reused": _checked(_ID),
     "ids_unsure": _checked(_NO_ID),
     "ids_exchanged": _checked(_ID),
     "ids_renewed": _checked(_NO_ID),
-    "landmark_moves": _checked(
-        "let the detector leave out this id; a run believes no sighting of it that contradicts others"
-    ),
+    "landmark_moves": _checked("let the detector leave out this id; a run leaves out what contradicts"),
     "landmark_moved": _checked("use landmarks that nobody moves"),
     "map_breaks": _checked("find out whether the robot was carried or slipped"),
     "outliers": _checked("correct the detector, or set landmarks.loss"),
@@ -340,23 +304,17 @@ CHECKED: dict[str, Row] = {
 
 OF_RUNS: dict[str, Row] = {
     "solve_failed": _checked("distances or noise that no robot has: --set INPUT.max_distance_m=... INPUT.noise=sigmas"),
-    "not_converged": _checked(
-        "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that "
-        "are believed contradict each other: graph_slam explain RUN lists those that fit worst"
-    ),
+    "not_converged": _checked("--set solve.max_iterations=1000; graph_slam explain RUN lists what fits worst"),
     "contradictory": _checked("measurements contradict each other: graph_slam explain RUN says which"),
     "contradicted": _checked(
-        "graph_slam explain RUN says why. Check units (metres and radians), signs (y and bearings to the left), the "
-        "place of the sensor (TF or INPUT.mount), its clock (INPUT.offset_s) and ids that are used twice. If only its "
-        "noise is larger than stated: --set INPUT.noise=sigmas --set INPUT.sigma_m=..."
+        "graph_slam explain RUN says why. Check units, signs (y and bearings to the left), the place of the sensor (TF "
+        "or INPUT.mount), its clock (INPUT.offset_s) and ids that are used twice. If only its noise is larger than "
+        "stated: --set INPUT.noise=sigmas --set INPUT.sigma_m=..."
     ),
     "contested": _checked("did it move, or is its id used twice?"),
     "unused": _checked(""),
     "not_seen_again": _checked(_NO_ID),
-    "confused": _checked(
-        "a density that is that of the landmarks, e.g. if they are 2 m apart --set landmarks.density_per_m=0.4; "
-        "classes, sizes or ids"
-    ),
+    "confused": _checked("landmarks.density_per_m, e.g. 0.4 if they are 2 m apart; classes, sizes or ids"),
     "ambiguous": _checked("graph_slam explain RUN"),
     "sides_unknown": _checked("more turns in sight of them, bearings, or surveyed landmarks (landmarks.surveyed)"),
     "visits_contradict": _checked("compare with --set map.condense=false; graph_slam check BAG; map.window_keyframes"),
@@ -366,7 +324,48 @@ OF_RUNS: dict[str, Row] = {
 }
 """What the end of a run finds beyond these, and the node while it goes on."""
 
-TABLE = COUNTED | CHECKED | OF_RUNS
+_SEE = "drive past known landmarks, or give initialpose"
+_OR_BY = "a lifecycle manager, or node.autostart:=true"
+_SLOWER = "a lower rate, or a larger keyframes.min_distance_m"
+_DATED = "tf.transform_tolerance:={0.limit:.1f} dates it ahead; INPUT.offset_s for a clock that differs"
+_LATE = "ordering.late_s:={0.limit:g}, or a faster detector; INPUT.offset_s for a clock that differs"
+_STOP = "stop it, or tf.publish_tf=false"
+_BEGIN_ANEW = "tf.stamp, tf.transform_tolerance; deactivate and activate the node, and listeners with it"
+
+OF_NODE: dict[str, Row] = {
+    "unconfigured": _found("nobody has configured it", f"ros2 lifecycle set NODE configure, {_OR_BY}"),
+    "inactive": _found("nobody has activated it", f"ros2 lifecycle set NODE activate, {_OR_BY}"),
+    "preparing": _found("{0.text}"),
+    "loading": _found("loads the map of {0.text}"),
+    "no_input": _found("no input", 'inputs.names: "odom detections"'),
+    "unpublished": _found("nobody publishes {0.topic}", "start its driver, or remap: -r odom:=OTHER"),
+    "unconnected": _found("{0.topic}: {0.text}", "INPUT.type, INPUT.reliability, INPUT.durability"),
+    "nothing_came": _found("{0.topic}: {0.text} publishes it, but nothing has come yet", "look at the driver"),
+    "its_turn": _found("{0.topic}: its first messages wait for their turn"),
+    "input_silent": _found("{0.topic}: silent for {0.value:.1f} s", "look at the driver"),
+    "comes_late": _found("{0.topic}: comes {0.value:.1f} s after its stamps, and so does map -> odom", _DATED),
+    "nearly_late": _found(
+        "{0.topic}: comes {0.value:.1f} s later than odometry of its time, and is soon refused", _LATE
+    ),
+    "no_clock": _found("use_sim_time is set and nothing comes on /clock", "publish it, or use_sim_time:=false"),
+    "clock_stands": _found("/clock stands still while messages come, so map -> odom waits", "use_sim_time:=false"),
+    "behind_last": _found("map -> odom is not sent: the last was dated {0.value:.0f} s later", _BEGIN_ANEW),
+    "rival": _found("somebody else broadcasts map -> odom: {0.text}", _STOP),
+    "static_rival": _found("somebody else publishes {0.topic} on /tf_static: {0.text}", _STOP),
+    "twin": _found("another node has this node's name and does the same", "stop one, or rename it (-r __node:=NAME)"),
+    "by_odometry_alone": _found("goes on by odometry alone since {0.text}, nothing recognised yet", _SEE),
+    "unlocated": _found("where the robot is in the loaded map is not known yet", _SEE),
+    "not_loaded": _found("output.load: the map was not loaded: {0.text}", "set another output.load and call ~/load"),
+    "unwritten": _found("the run cannot be written", "make room; the log names the error"),
+    "not_compiled": _found("kernels cannot be compiled ({0.text})", "try graph_slam warmup"),
+    "worker_ended": _found("the solver's thread has ended", "restart the node, and report it with the log"),
+    "callbacks": _found("{0.count} faults in callbacks in 10 s", "report it with the log"),
+    "stuck": _found("solver stuck: it has been at one thing for {0.value:.1f} s", "wait; health.stuck_s is the limit"),
+    "lagging": _found("the solver is {0.value:.1f} s behind, {0.count} messages wait", _SLOWER),
+}
+"""What the node finds of itself."""
+
+TABLE = COUNTED | CHECKED | OF_RUNS | OF_NODE
 
 
 def explain(code: str) -> Row:

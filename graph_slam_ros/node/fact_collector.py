@@ -2,28 +2,23 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from functools import partial
 from typing import TYPE_CHECKING
 
 from graph_slam_ros.errors import message_of
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.findings.table import Effect, explain
-from graph_slam_ros.node.diagnostics import WINDOW_S, Facts, Recent
-from graph_slam_ros.node.ingest import Ingest
-from graph_slam_ros.node.preparation import Preparation
-from graph_slam_ros.node.publishers import Publishers, PublishingClock
-from graph_slam_ros.node.session import Session
-from graph_slam_ros.node.subscriptions import Subscriptions
-from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
-from graph_slam_ros.node.worker import Worker, run_in_thread
+from graph_slam_ros.node.diagnostics import STATES, WINDOW_S, Facts, Recent
+from graph_slam_ros.node.worker import run_in_thread
 from graph_slam_ros.slam import Counters
 
 if TYPE_CHECKING:
-    from graph_slam_ros.node.node import GraphSlamNode
+    from graph_slam_ros.node.runtime import Runtime
 
 
-_LATELY_S = 3.0
+_LATELY_S, _TF_BEHIND_S, _MANY_FAULTS = 3.0, 1.0, 100
 _OF_ITS_OWN = {"overflow"}  # the verdict has a sentence for it
 Counts = Mapping[str, Mapping[str, int]]
 
@@ -71,95 +66,97 @@ def _refused(*counts: Counts) -> Counter[tuple[str, str]]:
 
 
 class FactCollector:
-    """Collects facts about once a second. Recent facts are those since the last collection.
+    """Collects facts about once a second. Recent facts are those since the last collection."""
 
-    Parameters
-    ----------
-    counters : of what is refused before the pipeline
-    """
-
-    def __init__(
-        self,
-        node: "GraphSlamNode",
-        counters: Counters,
-        session: Session,
-        worker: Worker,
-        ingest: Ingest,
-        publishers: Publishers,
-        clock: PublishingClock,
-    ) -> None:
-        self._node, self._counters, self._session = node, counters, session
-        self._worker, self._ingest, self._publishers, self._clock = worker, ingest, publishers, clock
+    def __init__(self, run: "Runtime") -> None:
+        self._run, self._node = run, run.node
         self._recent = RecentInputs()
         self._not_loaded = ""
         self._clock_ns, self._stands_since, self._processed = 0, 0.0, 0  # simulated time, since when it is that
-        self._before = 0, 0, 0  # overflows, failures and restarts until the last time
+        self._before = Counter[str]()  # what has happened until the last time
 
     def note_load(self, loaded: "Future[str]") -> None:
         """Note why the map that is to be loaded at the start cannot be."""
         if (error := loaded.exception()) is not None:
-            self._not_loaded = f"output.load: the map was not loaded: {message_of(error)}"
+            self._not_loaded = message_of(error)
 
-    def collect(
-        self,
-        lifecycle: str,
-        subscriptions: Subscriptions | None,
-        broadcaster: TfBroadcaster | None,
-        preparation: Preparation,
-    ) -> Facts:
-        """Collect the present facts.
-
-        Parameters
-        ----------
-        lifecycle : the state of the lifecycle
-        subscriptions, broadcaster : None while the node is not active
-        """
-        session, node, worker, gate = self._session, self._node, self._worker, self._ingest.gate
-        if not worker.waiting and node.now_ns:
-            worker.offer(session.evaluate)
-        if (check := self._ingest.check.job()) is not None:  # wrong units may keep the worker busy
+    def collect(self, lifecycle: str) -> Facts:
+        """Collect the present facts."""
+        run, node, session = self._run, self._node, self._run.session
+        if not run.worker.waiting and node.now_ns:
+            run.worker.offer(session.evaluate)
+        if (check := run.ingest.check.job()) is not None:  # wrong units may keep the worker busy
             run_in_thread(partial(_reported, check, node.report_fault))
-        pipeline = Counters()
+        pipeline, counters = Counters(), Counters()
         pipeline.update(session.slam.counters)
-        counters = Counters()
-        counters.update(self._counters)
+        counters.update(run.counters)
         counters.update(pipeline)
-        counted, processed = counters.as_dict(), self._clock.processed
-        recent = self._recent.observe(time.monotonic(), processed, self._counters.as_dict(), pipeline.as_dict())
-        overflows = sum(of.get("overflow", 0) for of in counted.values())
-        failures, restarts = session.failures, self._counters["node", "worker_restarted"]
-        before, self._before = self._before, (overflows, failures, restarts)
-        rivals, static = _rivals(broadcaster) if broadcaster is not None and node.config.tf.publish_tf else (None, "")
+        counted = counters.as_dict()
+        recent = self._recent.observe(time.monotonic(), run.clock.processed, run.counters.as_dict(), pipeline.as_dict())
+        inputs = run.subscriptions
         return Facts(
             lifecycle,
-            subscriptions.facts(node.now_ns, counted, recent, pipeline.used) if subscriptions is not None else (),
+            inputs.facts(node.now_ns, counted, recent, pipeline.used) if inputs is not None else (),
             session.estimate,
-            weakest=session.estimate.weakest(node.config.space) if session.estimate is not None else {},
-            waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
-            clock_stands=self._clock_stands(sum(processed.values())),
-            is_paused=gate.is_paused,
-            loads=session.loads,
-            is_stopped=gate.is_stopped,
-            lag_s=worker.lag_s,
-            waiting=worker.waiting,
-            busy_s=worker.busy_s,
-            worker_is_alive=worker.is_alive,
-            restarts=restarts - before[2],
-            failing=session.slam.view.failing,
-            overflows=overflows - before[0],
-            failures=failures - before[1],
-            recording_fails=session.recording_fails,
-            path_version=self._publishers.path_version,
-            has_other_authority=rivals is not None,
-            authorities=rivals or (),
-            static_authority=static,
-            twins=node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
-            findings=self._ingest.check.findings,
-            outcome=self._ingest.outcome,
-            tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
-            preparing=preparation.status,
-            cannot_prepare=preparation.fault or ("" if session.loaded_keyframes else self._not_loaded),
+            session.estimate.weakest(node.config.space) if session.estimate is not None else {},
+            tuple(self._found(sum(of.get("overflow", 0) for of in counted.values()))),
+            run.ingest.check.findings,
+            run.ingest.outcome,
+            run.publishers.path_version,
+            run.worker.lag_s,
+            run.worker.waiting,
+            node.faults,
         )
+
+    def _found(self, overflows: int) -> Iterator[Finding]:
+        """Yield what is wrong with the parts of the node: errors, what it waits for, and what makes it worse."""
+        run, node, session, worker = self._run, self._node, self._run.session, self._run.worker
+        error, note, warning = (partial(Finding, severity=severity) for severity, _ in STATES)
+        gate, health = run.ingest.gate, node.config.health
+        counts = Counter(
+            overflow=overflows, failures=session.failures, restarts=run.counters["node", "worker_restarted"]
+        )
+        lately, self._before = counts - self._before, counts
+        if run.preparation.fault:
+            yield error("not_compiled", text=run.preparation.fault)
+        elif self._not_loaded and not session.loaded_keyframes:
+            yield error("not_loaded", text=self._not_loaded)
+        elif not worker.is_alive:
+            yield error("worker_ended")
+        if node.faults >= _MANY_FAULTS:
+            yield error("callbacks", count=node.faults)
+        if node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) > 1:
+            yield error("twin")  # which broadcasts map -> odom, too
+        elif run.broadcaster is not None and node.config.tf.publish_tf:
+            yield from run.broadcaster.rivals()
+        if gate.is_stopped:
+            yield error("stopped")
+        if session.recording_fails:
+            yield error("unwritten")
+        if run.preparation.status:
+            yield note("preparing", text=run.preparation.status)
+        if session.loads:
+            yield note("loading", text=session.loads)
+        if node.get_parameter("use_sim_time").value and not node.now_ns:
+            yield note("no_clock") if session.estimate is None else warning("no_clock")
+        if self._clock_stands(sum(run.clock.processed.values())):
+            yield warning("clock_stands")
+        if gate.is_paused:
+            yield warning("paused", text="paused")
+        if run.broadcaster is not None and run.broadcaster.behind_s > _TF_BEHIND_S:
+            yield warning("behind_last", value=run.broadcaster.behind_s)
+        if failing := session.slam.view.failing:
+            yield warning("unsolved", text=f"solves fail, the last good estimate stands: {failing}")
+        elif lately["failures"]:
+            yield warning("unsolved", text=f"{lately['failures']} solves failed: the last good estimate stands")
+        if lately["restarts"]:
+            yield warning("worker_restarted")
+        if worker.busy_s > health.stuck_s and not session.loads:
+            yield warning("stuck", value=worker.busy_s)
+        if lately["overflow"]:
+            yield warning("overflow", text=f"{lately['overflow']} messages refused: the queue is full")
+        if worker.lag_s > health.lag_s:
+            yield warning("lagging", value=worker.lag_s, count=worker.waiting)
 
     def _clock_stands(self, processed: int) -> bool:
         """Return whether simulated time stands still, and messages are processed all the same."""
@@ -167,14 +164,6 @@ class FactCollector:
         if not now_ns or now_ns != self._clock_ns:
             self._clock_ns, self._stands_since = now_ns, now_s
         return now_s - self._stands_since > 2.0 and processed > before
-
-
-def _rivals(broadcaster: TfBroadcaster) -> tuple[tuple[str, ...] | None, str]:
-    """The nodes that may broadcast the transform as well, None where nobody does; and the transform if it is static."""
-    broadcaster.static.refresh()
-    if transform := broadcaster.static.transform:
-        return broadcaster.static.candidates(), transform
-    return (broadcaster.candidates() if broadcaster.has_rival else None), ""
 
 
 def _reported(work: Callable[[], None], on_fault: Callable[[Exception], None]) -> None:

@@ -1,7 +1,6 @@
 """The ROS node: its lifecycle, parameters, services and state. ``runtime`` handles the messages."""
 
 import os
-import re
 import signal
 import sys
 import threading
@@ -10,7 +9,6 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -260,6 +258,12 @@ class GraphSlamNode(LifecycleNode):
 
         future.add_done_callback(report)
 
+    @property
+    def faults(self) -> int:
+        """The number of exceptions of callbacks and jobs in the last ten seconds."""
+        since = time.monotonic() - 10.0
+        return sum(at > since for at in self._faults)
+
     def report_fault(self, error: Exception) -> None:
         """Count an exception of a callback or a job, and log its traceback once."""
         self._faults.append(time.monotonic())
@@ -276,9 +280,9 @@ class GraphSlamNode(LifecycleNode):
             self._run.tick()
 
     def _diagnose(self) -> None:
-        facts = diagnostics.Facts(self._state) if self._run is None else self._run.facts(self._state)
-        since = time.monotonic() - 10.0
-        facts = replace(facts, faults=sum(at > since for at in self._faults))
+        facts = (
+            diagnostics.Facts(self._state, faults=self.faults) if self._run is None else self._run.facts(self._state)
+        )
         verdict = diagnostics.judge(facts, self.config)
         self._log(verdict)
         statuses = diagnostics.statuses(facts, verdict, self.get_fully_qualified_name().lstrip("/"))
@@ -292,7 +296,7 @@ class GraphSlamNode(LifecycleNode):
         before, self._verdict = self._verdict, verdict
         has_lasted = before.state == verdict.state and time.monotonic() - self._logged_s > _AGAIN_S
         urgent = verdict.state in ("WAITING", "ERROR") and has_lasted
-        if _without_numbers(before) == _without_numbers(verdict) and not urgent:
+        if _kinds(before) == _kinds(verdict) and not urgent:
             return
         self._logged_s = time.monotonic()
         line = "; ".join((verdict.state, *verdict.reasons))
@@ -302,8 +306,8 @@ class GraphSlamNode(LifecycleNode):
             self.get_logger().warn(line)
 
 
-def _without_numbers(verdict: diagnostics.Health) -> tuple[str, ...]:
-    return (verdict.state, *(re.sub(r"\d+(\.\d+)?", "#", reason) for reason in verdict.reasons))
+def _kinds(verdict: diagnostics.Health) -> list[str]:
+    return [verdict.state, *(f"{one.code} {one.topic} {one.source}" for one in verdict.found)]
 
 
 class _StopRequest:

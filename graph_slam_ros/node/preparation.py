@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError, message_of
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.warmup import Compiling, are_compiled, warmup
 
 
@@ -33,8 +34,8 @@ class Preparation:
             self._log.info(str(error))
             return False
         except Exception as error:
-            self.fault = f"kernels cannot be compiled ({message_of(error)}): try graph_slam warmup"
-            self._log.error(self.fault)
+            self.fault = message_of(error)
+            self._log.error(str(Finding("not_compiled", "error", text=self.fault)))
             return False
         self.status = ""
         self._log.info(f"kernels ready after {elapsed_s:.1f} s")

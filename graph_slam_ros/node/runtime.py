@@ -46,58 +46,55 @@ class Runtime:
 
     def __init__(self, node: "GraphSlamNode") -> None:
         config = with_survey(node.config)
-        self._node = node
+        self.node = node
         self.counters = Counters()
         self.counters.on_first = self._warn
         with contextlib.ExitStack() as undo:  # what cannot be configured holds neither the run folder nor a topic
-            self._session = Session(config, self.counters, self._on_update, self._warn)
-            undo.callback(self._session.abandon)
-            self._publishers = Publishers(node, config)
-            undo.callback(self._publishers.close)
-            self._worker = Worker(config.inputs.queue, node.report_fault, self._on_exit_of_a_job)
-            undo.callback(self._worker.stop, 0.0)
-            self._clock = PublishingClock(node, self._session, self._publishers, self._worker)
-            self._ingest = Ingest(
-                *(node, config, self.counters, self._session, self._worker),
-                *(self._publishers, self._clock, self._begin_anew),
+            self.session = Session(config, self.counters, self._on_update, self._warn)
+            undo.callback(self.session.abandon)
+            self.publishers = Publishers(node, config)
+            undo.callback(self.publishers.close)
+            self.worker = Worker(config.inputs.queue, node.report_fault, self._on_exit_of_a_job)
+            undo.callback(self.worker.stop, 0.0)
+            self.clock = PublishingClock(node, self.session, self.publishers, self.worker)
+            self.ingest = Ingest(
+                *(node, config, self.counters, self.session, self.worker),
+                *(self.publishers, self.clock, self._begin_anew),
             )
             undo.pop_all()
-        self._facts = FactCollector(
-            *(node, self.counters, self._session, self._worker),
-            *(self._ingest, self._publishers, self._clock),
-        )
-        self._preparation = Preparation(node.get_logger(), config.world.dimensions)
-        for run in self._session.incomplete:
+        self._facts = FactCollector(self)
+        self.preparation = Preparation(node.get_logger(), config.world.dimensions)
+        for run in self.session.incomplete:
             node.get_logger().warn(f"{run.name}: stopped while measurements waited: graph_slam recover {run}")
-        self._subscriptions: Subscriptions | None = None
-        self._broadcaster: TfBroadcaster | None = None
+        self.subscriptions: Subscriptions | None = None
+        self.broadcaster: TfBroadcaster | None = None
 
     def prepare(self, is_stop_requested: Callable[[], bool]) -> None:
         """Make the worker load or compile the kernels before anything else."""
 
         def prepare() -> None:
-            if not self._preparation.run(is_stop_requested):
-                self._worker.leave()
+            if not self.preparation.run(is_stop_requested):
+                self.worker.leave()
 
-        self._worker.call(prepare)
+        self.worker.call(prepare)
 
     def activate(self) -> None:
         """Subscribe and broadcast. A second call changes nothing."""
-        if self._subscriptions is not None:
+        if self.subscriptions is not None:
             return
-        node, ingest = self._node, self._ingest
-        self._broadcaster = TfBroadcaster(node, self._session, ingest)
-        self._subscriptions = Subscriptions(node, node.config, ingest, self._broadcaster, self.counters)
+        node, ingest = self.node, self.ingest
+        self.broadcaster = TfBroadcaster(node, self.session, ingest)
+        self.subscriptions = Subscriptions(node, node.config, ingest, self.broadcaster, self.counters)
         ingest.activate()
 
     def deactivate(self) -> None:
         """Unsubscribe and stop broadcasting."""
-        if self._subscriptions is None or self._broadcaster is None:
+        if self.subscriptions is None or self.broadcaster is None:
             return
-        self._subscriptions.close()
-        self._broadcaster.close()
-        self._ingest.deactivate()
-        self._subscriptions = self._broadcaster = None
+        self.subscriptions.close()
+        self.broadcaster.close()
+        self.ingest.deactivate()
+        self.subscriptions = self.broadcaster = None
 
     def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
         """Save what is not saved yet, and remove everything, with the patience of ``Worker.stop``.
@@ -105,23 +102,23 @@ class Runtime:
         The next start completes what takes longer, because all accepted measurements are in the journal.
         """
         self.deactivate()
-        self._preparation.stop()
-        self._ingest.finish()
-        saved = self._worker.call(self._session.finish)
+        self.preparation.stop()
+        self.ingest.finish()
+        saved = self.worker.call(self.session.finish)
         try:
-            if self._worker.stop(patience_s, is_urgent) and saved.done():
+            if self.worker.stop(patience_s, is_urgent) and saved.done():
                 if folder := saved.result():
-                    self._node.get_logger().info(f"saved {Path(folder).name}")
+                    self.node.get_logger().info(f"saved {Path(folder).name}")
             else:
                 self._leave()
         finally:
-            self._session.abandon()
-            self._publishers.close()
+            self.session.abandon()
+            self.publishers.close()
 
     def _leave(self) -> None:
-        waiting, lost = self._session.leave()
-        folder, log = self._node.config.output.folder, self._node.get_logger()
-        if folder and (waiting or self._session.slam.processed):
+        waiting, lost = self.session.leave()
+        folder, log = self.node.config.output.folder, self.node.get_logger()
+        if folder and (waiting or self.session.slam.processed):
             what = f"while {waiting} measurements waited" if waiting else "before the last solve had ended"
             ends = f"graph_slam recover {folder} completes the results"
             log.warn(f"stopped {what}: all are in the journal; {ends}")
@@ -132,108 +129,108 @@ class Runtime:
 
     def tick(self) -> None:
         """Do what is due ten times a second."""
-        self._session.flush_in_background()
-        self._ingest.tick()
-        if self._subscriptions is not None:
-            self._subscriptions.tick(self._node.now_ns)
-        self._clock.tick()
+        self.session.flush_in_background()
+        self.ingest.tick()
+        if self.subscriptions is not None:
+            self.subscriptions.tick(self.node.now_ns)
+        self.clock.tick()
 
     def _on_exit_of_a_job(self) -> None:
         """Continue from the last good estimate after an exception that would have ended the thread."""
         self.counters.count("node", "worker_restarted")
-        self._node.get_logger().error("a job has ended the solver's thread; it goes on with the graph that there is")
-        self._session.slam.restart()
+        self.node.get_logger().error("a job has ended the solver's thread; it goes on with the graph that there is")
+        self.session.slam.restart()
 
     def _begin_anew(self, passage: Passage, source: str, why: str) -> None:
         """Carry out the gate's decision on a jump of time."""
         self._warn(source, f"{why}: {passage.jump}")
-        self._ingest.forget_time()
-        self._publishers.forget_time()
-        if self._broadcaster is not None:
-            self._broadcaster.forget_time()
+        self.ingest.forget_time()
+        self.publishers.forget_time()
+        if self.broadcaster is not None:
+            self.broadcaster.forget_time()
         if passage.jump == "reset":
-            self._node.in_background(self.reset())
+            self.node.in_background(self.reset())
         elif passage.events:
-            self._node.in_background(self._ingest.in_sequence(passage.events))
+            self.node.in_background(self.ingest.in_sequence(passage.events))
 
     def _warn(self, source: str, reason: str) -> None:
-        self._node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (logged once, counted from now on)")
+        self.node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (logged once, counted from now on)")
 
     def _on_update(self, slam: GraphSlam, update: Update) -> None:
         """Publish what an update changed, in the worker's thread."""
-        self._clock.on_update(slam, update)
+        self.clock.on_update(slam, update)
 
     def facts(self, lifecycle: str) -> Facts:
         """Collect the facts from which the state of the node is judged."""
-        return self._facts.collect(lifecycle, self._subscriptions, self._broadcaster, self._preparation)
+        return self._facts.collect(lifecycle)
 
     # -- services: begun here, done by the worker --------------------------------------------------------------------
 
     def save(self, config: Config | None = None) -> "Future[str]":
         """Solve everything, and write the run folder and the map under its configured name."""
-        if status := self._preparation.status:
+        if status := self.preparation.status:
             raise GraphSlamError(f"nothing to save yet: {status}; what has come is in the journal")
-        self._ingest.hand_over(self._ingest.converter.finish(is_end=False))
-        name = (config or self._node.config).output.save_as
-        return self._worker.call(partial(self._session.save, self._session.accept_save(), name))
+        self.ingest.hand_over(self.ingest.converter.finish(is_end=False))
+        name = (config or self.node.config).output.save_as
+        return self.worker.call(partial(self.session.save, self.session.accept_save(), name))
 
     @property
     def was_cut_off(self) -> bool:
         """Return whether the last run never ended: its map can be loaded."""
-        return self._session.was_cut_off
+        return self.session.was_cut_off
 
     def check_map(self, name: str) -> None:
         """Raise RunError if no run of that name can be loaded."""
-        self._session.earlier(name)
+        self.session.earlier(name)
 
     def load(self, config: Config | None = None) -> "Future[str]":
         """Continue from an earlier run, with the robot at the configured pose."""
-        output, pose = (config or self._node.config).output, (config or self._node.config).load_pose
-        return self._begin_run(partial(self._session.load, output.load, pose))
+        output, pose = (config or self.node.config).output, (config or self.node.config).load_pose
+        return self._begin_run(partial(self.session.load, output.load, pose))
 
     def load_at_start(self) -> None:
         """Load the configured map. If it cannot be loaded, that is a state until another is."""
         loaded = self.load()
         loaded.add_done_callback(self._facts.note_load)
-        self._node.in_background(loaded)
+        self.node.in_background(loaded)
 
     def resume(self) -> "Future[str]":
         """Continue from the last run, which never ended."""
-        return self._begin_run(self._session.resume)
+        return self._begin_run(self.session.resume)
 
     def reset(self) -> "Future[str]":
         """Save, and begin a new run."""
-        return self._begin_run(self._session.reset)
+        return self._begin_run(self.session.reset)
 
     def _begin_run(self, job: Callable[[], str]) -> "Future[str]":
-        self._ingest.gate.begin_run()
-        self._ingest.extrapolator.forget()
-        self._session.hold()
+        self.ingest.gate.begin_run()
+        self.ingest.extrapolator.forget()
+        self.session.hold()
 
         def begin() -> str:
             try:
                 done = job()
             finally:
-                self._session.release()
-            slam = self._session.slam
+                self.session.release()
+            slam = self.session.slam
             if slam.view.datum:
-                self._ingest.converter.begin_at(slam.view.datum)
-            self._publishers.begin(self._node.config, has_map=bool(slam.view.keyframes))
-            self._publishers.publish_due(slam.view)
+                self.ingest.converter.begin_at(slam.view.datum)
+            self.publishers.begin(self.node.config, has_map=bool(slam.view.keyframes))
+            self.publishers.publish_due(slam.view)
             return done
 
-        return self._worker.call(begin)
+        return self.worker.call(begin)
 
     def pause(self, is_paused: bool) -> "Future[str]":
         """Pause or resume the processing of measurements."""
-        self._ingest.gate.is_paused = is_paused
-        return self._worker.call(lambda: "paused" if is_paused else "takes measurements")
+        self.ingest.gate.is_paused = is_paused
+        return self.worker.call(lambda: "paused" if is_paused else "takes measurements")
 
     def control(self, event: Event) -> "Future[str]":
         """Process an event at its place in the ingest sequence."""
-        self._session.accept([asked := Control(event)])
-        return self._worker.call(partial(self._session.control, asked))
+        self.session.accept([asked := Control(event)])
+        return self.worker.call(partial(self.session.control, asked))
 
     def set(self, values: dict[str, Any]) -> None:
         """Change parameters at this place in the ingest sequence."""
-        self._node.in_background(self._ingest.in_sequence([Control("set", tuple(values.items()))]))
+        self.node.in_background(self.ingest.in_sequence([Control("set", tuple(values.items()))]))

@@ -3,6 +3,7 @@
 import math
 import time
 from collections import deque
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -10,6 +11,7 @@ from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.node import TfConfig
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.node.ingest import Ingest
@@ -108,11 +110,6 @@ class StaticRival:
         """The transform, as ``map -> odom``; empty where there is none."""
         return f"{self._parent} -> {self._frame}" if time.monotonic() < self._until_s else ""
 
-    def candidates(self) -> tuple[str, ...]:
-        """The other nodes that publish on /tf_static, one of which publishes the transform."""
-        names = set(map(full_name, self._node.get_publishers_info_by_topic(_TOPIC)))
-        return tuple(sorted(names - {self._node.get_fully_qualified_name()}))
-
     def refresh(self) -> None:
         """Ask again where a publisher has gone that may have published it. Call it about every second."""
         if not self.transform:
@@ -186,16 +183,19 @@ class TfBroadcaster:
         """The time by which the next transform would be dated before the last one; until it is 0, none is sent."""
         return self._policy.behind_s
 
-    @property
-    def has_rival(self) -> bool:
-        """Return whether another node has broadcast the transform lately on /tf."""
-        return time.monotonic() - self._others_s < _OTHERS_S
+    def rivals(self) -> Iterator[Finding]:
+        """Yield that another node broadcasts the transform, or gives odometry's frame another parent."""
+        self.static.refresh()
+        if transform := self.static.transform:
+            yield Finding("static_rival", "error", topic=transform, text=self._others_on(_TOPIC))
+        elif time.monotonic() - self._others_s < _OTHERS_S:
+            yield Finding("rival", "error", text=self._others_on("/tf"))
 
-    def candidates(self) -> tuple[str, ...]:
-        """The other nodes that publish on /tf, one of which broadcasts the transform."""
-        own = self._node.get_fully_qualified_name()
-        names = set(map(full_name, self._node.get_publishers_info_by_topic("/tf")))
-        return tuple(sorted(names - {own}))
+    def _others_on(self, topic: str) -> str:
+        """The other nodes that publish on a topic, one of which it is: a transform does not say who sent it."""
+        names = set(map(full_name, self._node.get_publishers_info_by_topic(topic)))
+        others = sorted(names - {self._node.get_fully_qualified_name()})
+        return f"one of {', '.join(others)}, which publish {topic}" if len(others) > 1 else "".join(others) or "a node"
 
     def _tick(self) -> None:
         config, odometry = self._node.config, self._ingest.extrapolator

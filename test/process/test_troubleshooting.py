@@ -3,7 +3,6 @@
 ``PYTHONPATH=test python test/process/test_troubleshooting.py`` writes the table of counters anew.
 """
 
-import ast
 import json
 import re
 import subprocess
@@ -15,7 +14,7 @@ import pytest
 from places import ROOT
 from rows import each
 
-from graph_slam_ros.findings.table import COUNTED
+from graph_slam_ros.findings.table import COUNTED, OF_NODE
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
@@ -23,12 +22,19 @@ from graph_slam_ros.slam import Config
 
 PAGE = ROOT / "docs/troubleshooting.md"
 USED = INPUT_COLUMNS["used"]
+REASONS, HOLE = "| reason | what to do |\n|---|---|\n", re.compile(r"\{0\.(\w+)[^}]*\}")
+HOLES = {"topic": "TOPIC", "text": "WHAT"}
 HEAD = "| counter | effect | what it means | remedy |\n|---|---|---|---|\n"
 
 
 def table():
     rows = (f"| `{name}` | {row.effect.value} | {row.meaning} | {row.remedy} |" for name, row in COUNTED.items())
     return HEAD + "\n".join(rows) + "\n"
+
+
+def reasons():
+    rows = ((row.meaning, row.remedy) for name, row in OF_NODE.items() if name not in ("preparing", "unconnected"))
+    return REASONS + "\n".join(HOLE.sub(lambda m: HOLES.get(m[1], "N"), f"| {a} | {b} |") for a, b in rows) + "\n"
 
 
 def blocks(kind, text=None):
@@ -41,22 +47,8 @@ def test_every_counter_is_on_the_page():
     )
 
 
-def reasons_of_states():
-    """What the verdict can say, as the constant pieces of each text."""
-    tree = ast.parse((ROOT / "graph_slam_ros/node/diagnostics.py").read_text())
-    for function in ast.walk(tree):
-        if isinstance(function, ast.FunctionDef) and ast.unparse(function.returns) in ("str", "Iterator[str]"):
-            for node in ast.walk(function):
-                if isinstance(node, ast.Yield | ast.Return):
-                    pieces = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and type(n.value) is str]
-                    yield from ([piece] for piece in pieces if len(piece.strip()) > 5 and " " in piece.strip())
-
-
 def test_every_reason_of_a_state_is_on_the_page():
-    page, found = PAGE.read_text(), [piece for pieces in reasons_of_states() for piece in pieces]
-    assert len(found) > 25
-    for piece in found:
-        assert piece.strip(" :;,") in page, piece
+    assert f"\n\n{reasons()}\n" in PAGE.read_text()
 
 
 @each("block", blocks("yaml"))
@@ -114,4 +106,5 @@ def test_the_publisher_of_detections_works_with_a_node_as_it_stands(tmp_path):
 
 
 if __name__ == "__main__":
-    PAGE.write_text(re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(), PAGE.read_text()))
+    text = re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(), PAGE.read_text())
+    PAGE.write_text(re.sub(re.escape(REASONS) + r"(\|.*\n)*", lambda _: reasons(), text))

@@ -28,7 +28,7 @@ def test_A35_an_input_that_is_refused_is_degraded_with_the_remedy_while_it_is_an
         drive, _tags = Drive(), r.publisher("/tags", Detection3DArray)
         drive.sees = False
         r.until_it_says("WAITING", "publishes it, but nothing has come yet")
-        what = "nothing corrects odometry: nobody publishes /landmarks; /tags has this type: detections.topic:=/tags"
+        what = "nothing corrects odometry: nobody publishes /landmarks: /tags has this type: detections.topic:=/tags"
         r.until_it_says("DEGRADED", what, spin=drive.pace(r))
         landmarks = r.publisher("/landmarks", Detection3DArray)
         r.until_it_says("OK", spin=drive.pace(r))
