@@ -5,6 +5,7 @@
 # check         style, types and the unit tests, in a minute: after each change; no process, no ROS
 # test          install, then style, types and all tests; some of them: TESTS='-m "not process"', -m integration, a file
 # soak          the tests that take too long for every run: up to three hours, resumed where it was; ONLY=name,name
+# site          the pages and the API as a site in site/, searchable, without a wrong link; in .venv-docs
 # wheel         dist/: a wheel with compiled kernels in it, for the Python and the kind of machine that this is
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS=, too
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
@@ -32,7 +33,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo check test soak wheel colcon test-oldest lint format lock bench robust figures pictures clean
+.PHONY: install demo check test soak site wheel colcon test-oldest lint format lock bench robust figures pictures clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/package.stamp
@@ -146,6 +147,14 @@ $(VENV)-oldest/stamp: constraints-oldest.txt setup.py setup.cfg pyproject.toml
 test-oldest: $(VENV)-oldest/stamp
 	$(VENV)-oldest/bin/python -m pytest -q
 
+$(VENV)-docs/stamp: docs/requirements.txt setup.py setup.cfg pyproject.toml
+	$(PYTHON) -m venv $(VENV)-docs
+	$(VENV)-docs/bin/pip install --quiet -r docs/requirements.txt -e .
+	@touch $@
+
+site: $(VENV)-docs/stamp
+	$(VENV)-docs/bin/sphinx-build --quiet --fail-on-warning -d $(VENV)-docs/doctrees docs site
+
 $(VENV)-bench/stamp: benchmarks/requirements.txt setup.py setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)-bench
 	$(VENV)-bench/bin/pip install --quiet -r benchmarks/requirements.txt -e .
@@ -179,4 +188,4 @@ COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3
   --no-emit-index-url --no-annotate --custom-compile-command 'make lock' $(LOCK)
 
 clean:
-	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o build dist install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-docs $(VENV)-bench $(VENV)-bench-g2o build dist site install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

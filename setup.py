@@ -13,7 +13,8 @@ HERE = Path(__file__).resolve().parent
 # The text is searched: importing the package here would need its dependencies.
 VERSION = re.search(r'^__version__ = "(.+)"$', (HERE / NAME / "__init__.py").read_text(), re.MULTILINE).group(1)
 
-HOME = f"https://github.com/{os.environ.get('GITHUB_REPOSITORY', 'graph-slam-ros/graph_slam_ros')}"
+OWNER, REPOSITORY = os.environ.get("GITHUB_REPOSITORY", "graph-slam-ros/graph_slam_ros").split("/")
+HOME = f"https://github.com/{OWNER}/{REPOSITORY}"
 README = (HERE / "README.md").read_text(encoding="utf-8")
 # Elsewhere than in the repository, pictures and pages are found by their whole addresses.
 README = re.sub(r'src="(?!http)', f'src="{HOME}/raw/{VERSION}/', README)
@@ -75,7 +76,7 @@ setup(
     long_description_content_type="text/markdown",
     url=HOME,
     project_urls={
-        "Documentation": f"{HOME}/blob/{VERSION}/docs/index.md",
+        "Documentation": f"https://{OWNER}.github.io/{REPOSITORY}/",
         "Changelog": f"{HOME}/blob/{VERSION}/CHANGELOG.rst",
     },
     keywords="SLAM pose-graph ROS robotics localization mapping landmarks GNSS",

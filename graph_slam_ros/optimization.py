@@ -93,7 +93,7 @@ class Solution:
 
     @property
     def poses(self) -> Array:
-        """Estimates of all poses in order of id: (n, 3) as x, y, theta, or (n, 7) as x, y, z and quaternion xyzw."""
+        """Estimates of all poses in order of id, (n, 3) as x, y, theta, or (n, 7) as x, y, z and quaternion xyzw."""
         graph = self.file.graph
         return self.solver.estimate([v for v in graph.vertex_ids.since().tolist() if _is_pose(graph, v)])
 

@@ -126,7 +126,7 @@ class Config:
 
     @property
     def condenses(self) -> bool:
-        """Return whether old visits are condensed: where that is wanted, and nothing forbids it."""
+        """Return whether old visits are condensed, where that is wanted, and nothing forbids it."""
         return self.map.condense and not self.not_condensed
 
     @property

@@ -54,7 +54,7 @@ class SavedRun:
 
     @cached_property
     def edges(self) -> list[Entry]:
-        """The ledger: each edge, its measurement and its verdict."""
+        """The ledger, each edge, its measurement and its verdict."""
         return read_ledger(self.folder)
 
     @property

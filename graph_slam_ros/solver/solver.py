@@ -318,7 +318,7 @@ class Solver:
 
     @property
     def is_current(self) -> bool:
-        """Return whether nothing is pending: covariances then include all edges, and reading them changes nothing."""
+        """Return whether nothing is pending, covariances then include all edges, and reading them changes nothing."""
         return self._numbers_current and not self._pending
 
     def update(self) -> Change:
