@@ -4,20 +4,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import replaced
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.to_msg import (
     covariance6,
+    detections,
     encode,
     header,
     make,
+    odometry,
     pose_stamped,
-    pose_with_covariance,
     quaternion,
     transform,
     vector,
@@ -147,21 +149,13 @@ def _mounted_sensor(recording: Recording) -> Iterator[Message]:
 
 
 def _odometry(recording: Recording) -> Iterator[Message]:
-    name, covariance = "nav_msgs/msg/Odometry", covariance6(recording.twist_covariance, _UNUSED)
-    for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
-        velocity = recording.twist[k].tolist()
-        if len(velocity) == 3:
-            velocity = [velocity[0], velocity[1], 0.0, 0.0, 0.0, velocity[2]]
-        twist = make("geometry_msgs/msg/Twist", linear=vector(*velocity[:3]), angular=vector(*velocity[3:]))
-        at = tuple(recording.T_odom_base[k].tolist())
-        message = make(
-            name,
-            header=header(stamp_ns, "odom"),
-            child_frame_id="base_link",
-            pose=pose_with_covariance(at, recording.odom_covariance[k], _UNUSED),
-            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
-        )
-        yield ODOMETRY_TOPIC, name, stamp_ns, encode(message)
+    twists = np.zeros((len(recording.twist), 42))
+    twists[:, [0, 1, 5] if recording.twist.shape[1] == 3 else slice(6)] = recording.twist
+    twists[:, 6:] = covariance6(recording.twist_covariance, _UNUSED)
+    poses, covariances = recording.T_odom_base.tolist(), recording.odom_covariance
+    for stamp_ns, at, covariance, twist in zip(recording.stamps_ns.tolist(), poses, covariances, twists, strict=True):
+        cdr = odometry(stamp_ns, "odom", "base_link", tuple(at), covariance, _UNUSED, twist.tobytes())
+        yield ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, cdr
 
 
 def _truth(recording: Recording) -> Iterator[Message]:
@@ -202,9 +196,14 @@ def _closures(recording: Recording) -> Iterator[Message]:
 
 
 def _detections(topic: str, stamp_ns: int, frame: str, seen: Sequence[Sighting], space: Geometry) -> Message:
-    head = header(stamp_ns, frame)
-    several = make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen])
-    return topic, _DETECTIONS, stamp_ns, encode(several)
+    poses, covariances = np.tile(space.identity, (len(seen), 1)), np.empty((len(seen), 36))
+    for s, pose, row in zip(seen, poses, covariances, strict=True):
+        pose[: len(s.measured)] = s.measured
+        known, covariance = space.dof if s.kind == "pose" else space.dimensions, _UNUSED * np.eye(space.dof)
+        covariance[:known, :known] = np.reshape(s.covariance, (known, known))
+        row[:] = covariance6(space.in_parent_axes(tuple(pose), covariance), _UNUSED)
+    cdr = detections(stamp_ns, frame, [s.id for s in seen], se3.in_space(poses), covariances)
+    return topic, _DETECTIONS, stamp_ns, cdr
 
 
 def _point_cloud(seen: Sightings, names: Mapping[str, str]) -> bytes:
@@ -235,18 +234,3 @@ def _point_cloud(seen: Sightings, names: Mapping[str, str]) -> bytes:
         is_dense=True,
     )
     return encode(message)
-
-
-def _detection(head: Any, s: Sighting, space: Geometry) -> Any:
-    known = space.dof if s.kind == "pose" else space.dimensions
-    covariance = _UNUSED * np.eye(space.dof)
-    covariance[:known, :known] = np.reshape(s.covariance, (known, known))
-    posed = pose_with_covariance((*s.measured, *space.identity[len(s.measured) :]), covariance, _UNUSED)
-    hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=s.id, score=1.0)
-    return make(
-        "vision_msgs/msg/Detection3D",
-        header=head,
-        results=[make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=posed)],
-        bbox=make("vision_msgs/msg/BoundingBox3D", center=posed.pose, size=vector(0.0, 0.0)),
-        id=s.id,
-    )
