@@ -11,8 +11,8 @@
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  check style, layers, budgets and types; correct the style
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
-# bench         measure ours against GTSAM and g2o into docs/benchmarks.md and accuracy.md; hours
-# robust        measure ours and GTSAM with false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
+# bench         measure ours against GTSAM and g2o into docs/figures, and the tables of the pages; hours
+# robust        the same with false closures and wrong ids; two hours, resumed where it was
 # figures       measure the table that must not get worse, docs/figures/figures.csv, and compare; half an hour; WRITE=1 replaces it
 # pictures      draw the pictures of README.md and docs/ again, in Chromium
 # clean         remove what these made
@@ -166,11 +166,11 @@ $(VENV)-bench-g2o/stamp: benchmarks/requirements-g2o.txt
 	@touch $@
 
 bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
-	$(VENV)-bench/bin/python -m benchmarks
+	for name in batch online consistency marginals; do $(VENV)-bench/bin/python -m benchmarks.$$name --write || exit; done
+	$(VENV)-bench/bin/python -m benchmarks.lifelong --keyframes 6000 --seeds 1 --write
 
 robust: $(VENV)-bench/stamp
-	$(VENV)-bench/bin/python -m benchmarks.robust --jobs 2 --keep benchmarks/results/robust --json benchmarks/results/robust.json
-	$(VENV)-bench/bin/python -m benchmarks.table benchmarks/results/robust.json
+	$(VENV)-bench/bin/python -m benchmarks.robust --jobs 2 --keep benchmarks/results/robust --write
 
 figures: $(VENV)-bench/stamp
 	$(VENV)-bench/bin/python -m benchmarks.figures $(if $(WRITE),--write) $(if $(ONLY),--only '$(ONLY)')

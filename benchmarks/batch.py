@@ -47,7 +47,7 @@ def main() -> None:
     options.add_peers(parser, BATCH_PEERS)
     args = parser.parse_args()
     rows = [race(problem, args.peers, args.reps) for problem in options.problems(args)]
-    table.finish(table.results("batch", rows, f"medians of {args.reps} repetitions"), args.json)
+    table.finish("batch", rows, write=args.write, note="once" if args.reps == 1 else "")
 
 
 if __name__ == "__main__":

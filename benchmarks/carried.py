@@ -14,8 +14,8 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Measurement
 from graph_slam_ros.typing import Array
 
-SEEDS, MOMENTS_S = range(14), (10.0, 20.0, 30.0, 50.0)
-"""56 drives."""
+MOMENTS_S = (10.0, 20.0, 30.0, 50.0)
+"""Of seeds 0 to 13: 56 drives."""
 _CORNERS = np.array([(0.0, 0.0), (20.0, 0.0), (20.0, 12.0), (0.0, 12.0)])
 _LAP_M, _LAP_S, _LAPS, _STEP_S, _AHEAD_M = 64.0, 60.0, 2.5, 0.1, 1.5
 _REACH_M, _SIGMA_RANGE, _SIGMA_BEARING = 8.0, 0.05, 0.02

@@ -9,7 +9,6 @@ depart from that.
 import argparse
 import random
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -111,7 +110,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=values.count, default=100, metavar="N", help="so many drives, and fresh ones")
     about = "a setting that departs from that"
     parser.add_argument("--changed", action="append", default=[], choices=[*_CHANGED, "all"], help=about)
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
+    table.add_write(parser)
     args = parser.parse_args()
     for name in args.worlds:
         if name not in _WORLDS:
@@ -129,7 +128,7 @@ def main() -> None:
             if {label, "all"} & set(args.changed):
                 for (what, expected), mean in zip(of, measure(name, range(args.seeds), _TOLD | changed), strict=True):
                     rows.append({"world": f"{name}, {label}", "NEES of": what, "expected": expected, first: mean})
-    table.finish(table.results("consistency", rows), args.json)
+    table.finish("consistency", rows, write=args.write, keys=2)
 
 
 if __name__ == "__main__":

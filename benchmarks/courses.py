@@ -122,26 +122,14 @@ def _mrclam(name: str, robot: int) -> tuple[Drawn, Array]:
     """And the true poses (n, 3) at the stamps of the sightings, NaN where they are not known."""
     with tempfile.TemporaryDirectory() as folder:
         path = datasets.mrclam(robot, Path(folder) / "bag")
-        view = driven(path, {"map.condense": False}, (Control("end"),))  # every sighting is wanted
-        drawn = Drawn.of(name, view)
-        return drawn, true_poses(path, drawn.stamps_s)
-
-
-def driven(path: Path, settings: dict[str, object], end: tuple[Control, ...]) -> MapView:
-    """A replay of a recording in memory."""
-    bag, config = open_bag(path), Config.from_mapping(settings)
-    slam = GraphSlam(config)
-    for _, several in RecordedRuns(bag, choose_inputs(bag, config), config, Counters()):
-        for m in several:
-            slam.process(m)
-    for event in end:
-        slam.process(event)
-    return slam.view
-
-
-def true_poses(path: Path, stamps_s: Array) -> Array:
-    """The true poses (n, 3) of a recording at stamps, NaN where they are not known."""
-    return np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, stamps_s)))
+        bag, config = open_bag(path), Config.from_mapping({"map.condense": False})  # every sighting is wanted
+        slam = GraphSlam(config)
+        for _, several in RecordedRuns(bag, choose_inputs(bag, config), config, Counters()):
+            for m in several:
+                slam.process(m)
+        slam.process(Control("end"))
+        drawn = Drawn.of(name, slam.view)
+        return drawn, np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, drawn.stamps_s)))
 
 
 def of_park(kept: Kept) -> Course:

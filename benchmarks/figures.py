@@ -35,6 +35,7 @@ from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.runs.replay import replay as replayed
 from graph_slam_ros.runs.trajectory import read_landmarks
 from graph_slam_ros.slam import Config, Control, GraphSlam, MapView, Measurement
+from graph_slam_ros.slam.landmarks.rotations import aligned
 from graph_slam_ros.tools.simulation import Fault, Recording, faulty_recording, measurements, simulate, write_bag
 from graph_slam_ros.typing import Array
 
@@ -63,7 +64,7 @@ def _unnamed_map(bag: Path, run: Path) -> Iterator[Row]:
     stamps_s = truth.trajectory.stamps_s
     path = path[(path[:, 0] > stamps_s[0]) & (path[:, 0] < stamps_s[-1])]
     true = np.stack([np.interp(path[:, 0], stamps_s, truth.trajectory.poses[:, k]) for k in (0, 1)], axis=1)
-    turn, shift = judge.fitted(path[:, 1:3], true)
+    turn, shift = aligned(path[:, 1:3], true)
     marks = read_landmarks(run / "landmarks.csv").positions[:, :2] @ turn.T + shift
     poles = np.array([one[:2] for one in truth.landmarks.values()])
     apart = np.linalg.norm(poles[:, None] - marks[None], axis=2)

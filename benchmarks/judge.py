@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.problem import Array, Edges, Problem
 from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.slam.landmarks.rotations import aligned
 
 
 def chi2(problem: Problem, poses: Array, landmarks: Array) -> float | None:
@@ -36,18 +37,9 @@ def _squared(edges: Edges, residuals: Array) -> Array:
     return np.asarray(np.square(np.einsum("nij,nj->ni", edges.root, residuals)).sum(axis=1))
 
 
-def fitted(estimated: Array, true: Array) -> tuple[Array, Array]:
-    """The rotation and shift of the rigid motion that lays positions on others best, without scale (Umeyama 1991)."""
-    middle, centre = estimated.mean(axis=0), true.mean(axis=0)
-    u, _, vt = np.linalg.svd((estimated - middle).T @ (true - centre))
-    flip = np.diag([*[1.0] * (len(middle) - 1), np.sign(np.linalg.det(vt.T @ u.T))])
-    turn = vt.T @ flip @ u.T
-    return turn, centre - turn @ middle
-
-
 def distances(estimated: Array, true: Array) -> Array:
     """Distances (n,) of positions from the true ones, after they were laid on these."""
-    turn, shift = fitted(estimated, true)
+    turn, shift = aligned(estimated, true)
     return np.asarray(np.linalg.norm(estimated @ turn.T + shift - true, axis=1))
 
 

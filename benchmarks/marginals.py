@@ -105,7 +105,7 @@ def main() -> None:
             options.say(str(rows[-1]))
         except fresh.Crashed as error:
             options.say(f"{problem.name}: {error}")
-    table.finish(table.results("marginals", rows), args.json)
+    table.finish("marginals", rows, write=args.write)
 
 
 if __name__ == "__main__":

@@ -9,19 +9,17 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 from statistics import median
 
 import numpy as np
 
 from benchmarks import options, table
-from benchmarks.live.robot import BARE, Process, Robot, node, ros, running, transitions
+from benchmarks.live.robot import BARE, Process, Robot, node, ros, running
 from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, CLOSURES, LANDMARKS, ODOMETRY
 from benchmarks.table import Row
 from graph_slam_ros.warmup import warmup
 
 _WARM_S = 5.0
-_TRANSITIONS = ("configure", "activate", "deactivate", "cleanup")
 _CITY = {  # a keyframe for each pose, and the noise that the world has
     "inputs.names": "odom closings",
     "inputs.reliable": True,
@@ -143,24 +141,11 @@ def idle(short: bool) -> list[Row]:
     return rows
 
 
-def lifecycle(short: bool) -> list[Row]:
-    """How long a lifecycle manager waits for each transition: Nav2's gives up after 5 s."""
-    took = []
-    for _ in range(3 if short else 10):
-        with node({"node.autostart": False}):
-            took.append(list(transitions(*_TRANSITIONS)))
-    return [
-        {"transition": name, "starts": len(of), "median s": median(of), "longest s": max(of)}
-        for name, of in zip(_TRANSITIONS, zip(*took, strict=True), strict=True)
-    ]
-
-
 FIGURES: dict[str, Callable[[bool], list[Row]]] = {
     "cpu": cpu,
     "rate": rate,
     "latency": latency,
     "idle": idle,
-    "lifecycle": lifecycle,
 }
 
 
@@ -169,22 +154,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(FIGURES)} (default: all)")
     parser.add_argument("--short", action="store_true", help="a short look: seconds instead of minutes")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
+    table.add_write(parser)
     args = parser.parse_args()
     for name in args.names:
         if name not in FIGURES:
             parser.error(f"{name} is none of {', '.join(FIGURES)}")
     warmup()  # so that nobody waits for compilers
-    measured = []
     for name in args.names or FIGURES:
         options.say(f"{name}{', a short look' if args.short else ''}")
         with ros():
             rows = FIGURES[name](args.short)
-        measured.append(table.results(f"node-{name}", rows, "a short look" if args.short else ""))
-        print(f"{name}\n\n{table.markdown(measured[-1])}\n", flush=True)
-        if args.json is not None:
-            args.json.parent.mkdir(parents=True, exist_ok=True)
-            args.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+        table.finish(f"node-{name}", rows, write=args.write, note="a short look" if args.short else "")
 
 
 if __name__ == "__main__":

@@ -59,9 +59,9 @@ def main() -> None:
     parser.add_argument("--path", action="store_true", help="read the whole path after each step, not the newest pose")
     args = parser.parse_args()
     rows = [row(problem, race(problem, args.reps, args.path)) for problem in options.problems(args)]
-    programme, read = ("online-path", "the whole path") if args.path else ("online", "the newest pose")
-    about = f"{read} is read after each step; medians of {args.reps} repetitions"
-    table.finish(table.results(programme, rows, about), args.json)
+    table.finish(
+        "online-path" if args.path else "online", rows, write=args.write, note="once" if args.reps == 1 else ""
+    )
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
 
+from benchmarks import table
 from benchmarks.datasets import DATASETS
 from benchmarks.problem import Problem, chain_problem, read_problem, sphere_problem
 from graph_slam_ros.cli import arguments as values
@@ -25,6 +26,7 @@ _BEST_KNOWN = {
     "parking-garage": 1.26838,
     "torus3D": 24234.71,
     "smallGrid3D": 1033.894,
+    "tinyGrid3D": 18.61616,
     "ring": 11.1631,
     "victoria_park": 6184.12,
     "w10000": 289.7259,
@@ -38,7 +40,7 @@ def parser(about: str | None) -> argparse.ArgumentParser:
     about = "graphs; sphere and chain are simulated (default: all that are at hand, and the sphere)"
     options.add_argument("files", nargs="*", type=Path, metavar="FILE", help=about)
     options.add_argument("--poses", type=values.count, metavar="N", help="the first N poses of each graph only")
-    options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
+    table.add_write(options)
     return options
 
 

@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks import datasets
+from benchmarks import datasets, table
 from benchmarks.fresh import ROOT, children_s
 from graph_slam_ros.cli import arguments as values
 
@@ -71,17 +71,6 @@ def times(bag: Path, command: str, options: list[str], reps: int) -> tuple[int, 
     return count, command_s, reading_s
 
 
-def compare(bag: Path, command: str, options: list[str], reps: int) -> str:
-    """Return a line with the medians of both, and the ratio."""
-    count, command_s, reading_s = times(bag, command, options, reps)
-    reading, whole = statistics.median(reading_s), statistics.median(command_s)
-    spread = ", ".join(f"{a:.1f}/{b:.2f}" for a, b in zip(command_s, reading_s, strict=True))
-    return (
-        f"{bag.name}: {command} {whole:.2f} s of CPU, reading {count} messages {reading:.2f} s:"
-        f" {whole / reading:.1f} times ({spread})"
-    )
-
-
 def main() -> None:
     """Compare, and print a line for each recording."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -89,10 +78,23 @@ def main() -> None:
     parser.add_argument("--reps", type=values.count, default=3, metavar="N", help="repetitions (default: 3)")
     parser.add_argument("--command", default="replay", metavar="NAME", help="of graph_slam (default: replay)")
     parser.add_argument("--options", default="", metavar="TEXT", help="more options of the command, in one word")
+    table.add_write(parser)
     args = parser.parse_args()
+    rows = list[table.Row]()
     with tempfile.TemporaryDirectory(prefix="recording-") as folder:
         for bag in args.bags or [datasets.mrclam(_ROBOT, Path(folder) / f"mrclam7_{_ROBOT}")]:
-            print(compare(bag, args.command, shlex.split(args.options), args.reps), flush=True)
+            count, command_s, reading_s = times(bag, args.command, shlex.split(args.options), args.reps)
+            reading, whole = statistics.median(reading_s), statistics.median(command_s)
+            rows.append(
+                {
+                    "recording": bag.stem.replace("mrclam7_", "MR.CLAM 7, robot "),
+                    "graph_slam": args.command,
+                    "messages": count,
+                    "CPU (s)": whole,
+                    "of reading": f"{whole / reading:.1f}",
+                }
+            )
+    table.finish("replay", rows, write=args.write, keys=2)
 
 
 if __name__ == "__main__":

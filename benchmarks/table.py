@@ -1,12 +1,16 @@
-"""Results as JSON and as Markdown tables; a table has its place in a document between two markers.
+"""Tables of figures: their home is docs/figures/NAME.csv, and pages show them between two markers.
 
-``python -m benchmarks.table RESULTS.json ...`` puts earlier results where they belong, into docs/*.md.
+``python -m benchmarks.table`` writes the tables of README.md and docs/*.md anew. A row of a csv has three more columns:
+when and on what it was measured, a note on that, which both stand below the table, and the command.
 """
 
+import argparse
 import contextlib
+import csv
 import datetime
-import json
 import platform
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -19,55 +23,98 @@ from benchmarks.fresh import ROOT
 Row = dict[str, Any]
 """A line of a table, by the names of its columns."""
 
-_LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "ros-jazzy-rclpy")
+FIGURES = ROOT / "docs/figures"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+MEASURED, NOTE, COMMAND = "measured", "note", "command"
+_ASIDE = (MEASURED, NOTE, COMMAND)
+_PLACE = re.compile(r"(<!-- (\S+): begin -->\n).*?(<!-- \2: end -->)", re.DOTALL)
+_LIBRARIES = ("gtsam", "g2o-python", "ros-jazzy-rclpy")
 
 
-def results(programme: str, rows: Sequence[Row], about: str = "") -> Row:
-    """Rows with what they were measured by, on, and when."""
-    return {
-        "programme": programme,
-        "about": about,
-        "date": datetime.date.today().isoformat(),
-        "machine": f"{_cpu()}, Python {platform.python_version()}, {', '.join(_versions())}",
-        "rows": list(rows),
+def add_write(options: argparse.ArgumentParser) -> None:
+    """Add ``--write``."""
+    options.add_argument("--write", action="store_true", help="into docs/figures, and the table of the page anew")
+
+
+def finish(name: str, rows: Sequence[Row], *, write: bool, note: str = "", keys: int = 1) -> None:
+    """Print a table; if asked for write it, in the place of earlier rows that have the same first columns."""
+    aside = {
+        MEASURED: f"{datetime.date.today()}, {_cpu()}, Python {platform.python_version()}, {', '.join(_versions())}"
     }
+    aside |= {NOTE: note, COMMAND: _command()}
+    found = [{column: _cell(value) for column, value in row.items()} | aside for row in rows]
+    print(markdown(found), flush=True)
+    if write:
+        by_key = {tuple(row.values())[:keys]: row for row in (*read(name), *found)}
+        columns = dict.fromkeys(column for row in by_key.values() for column in row if column not in _ASIDE)
+        with (FIGURES / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
+            out = csv.DictWriter(file, [*columns, *_ASIDE], restval="", lineterminator="\n")
+            out.writeheader()
+            out.writerows(by_key.values())
+        write_pages()
 
 
-def finish(measured: Row, path: Path | None) -> None:
-    """Print a table, and keep the results where that was asked for."""
-    print(markdown(measured))
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+def read(name: str) -> list[dict[str, str]]:
+    """Return the rows of a table; none if there is no such table yet."""
+    path = FIGURES / f"{name}.csv"
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines())) if path.exists() else []
 
 
-def markdown(measured: Row) -> str:
-    """The results of a programme, and below them how and on what they were measured."""
-    names = list(dict.fromkeys(name for row in measured["rows"] for name in row))
-    lines = [names, ["---"] * len(names), *([_cell(row.get(name)) for name in names] for row in measured["rows"])]
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    about = f"{measured['about']}; " if measured["about"] else ""
-    return f"{table}\n\n{about}{measured['date']}, {measured['machine']}."
+def markdown(rows: Sequence[dict[str, str]]) -> str:
+    """A table as a page shows it. What begins as the row before does not say so again."""
+    columns = list(dict.fromkeys(column for row in rows for column in row if column not in _ASIDE))
+    lines, before = [columns, ["---"] * len(columns)], ""
+    for row in rows:
+        first, *others = (row.get(column, "") for column in columns)
+        lines.append(["" if first == before else first, *others])
+        before = first
+    table = "\n".join(f"| {' | '.join(map(_shown, line))} |" for line in lines)
+    return f"{table}\n\n{'; '.join(_below(rows))}."
+
+
+def _below(rows: Sequence[dict[str, str]]) -> Iterator[str]:
+    """When and on what most was measured; of other rows when, and what is noted."""
+    yield rows[0][MEASURED]
+    said: dict[str, dict[str, None]] = {}
+    for row in rows:
+        day = row[MEASURED].partition(",")[0] if row[MEASURED] != rows[0][MEASURED] else ""
+        if text := ", ".join(filter(None, (day, row[NOTE]))):
+            said.setdefault(text, {})[_shown(next(iter(row.values())))] = None
+    for text, names in said.items():
+        yield (
+            text
+            if len(names) == len({_shown(next(iter(row.values()))) for row in rows})
+            else f"{', '.join(names)}: {text}"
+        )
+
+
+def _shown(cell: str) -> str:
+    return f"{int(cell):,}" if cell.isdigit() else cell.replace("|", "/")
 
 
 def _cell(value: Any) -> str:
     """A number with three digits that count."""
     if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
-    return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value).replace("|", "/")
+        return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+    return "" if value is None else str(value)
 
 
-def into_document(measured: Row) -> None:
-    """Put a table between its markers, in the place of an earlier one."""
-    begin, end = (mark.format(measured["programme"]) for mark in ("<!-- {}: begin -->", "<!-- {}: end -->"))
-    for document in sorted((ROOT / "docs").glob("*.md")):
-        text = document.read_text(encoding="utf-8")
-        if begin in text:
-            head, rest = text.split(begin)
-            _, tail = rest.split(end)
-            document.write_text(f"{head}{begin}\n{markdown(measured)}\n{end}{tail}", encoding="utf-8")
-            return
-    print(f"docs/ has no place for {measured['programme']}", file=sys.stderr)
+def rendered(page: str) -> str:
+    """The text of a page with its tables as docs/figures has them."""
+    return _PLACE.sub(lambda at: f"{at[1]}{markdown(read(at[2]))}\n{at[3]}", page)
+
+
+def write_pages() -> None:
+    """Write the tables of all pages anew."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        page.write_text(rendered(text), encoding="utf-8")
+
+
+def _command() -> str:
+    """What was called, without folders of this machine."""
+    words = [Path(word).name if "/" in word else word for word in sys.argv[1:] if word != "--write"]
+    return shlex.join(["python", "-m", f"benchmarks.{Path(sys.argv[0]).stem}", *words])
 
 
 def _cpu() -> str:
@@ -90,7 +137,4 @@ def _versions() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    for source in sys.argv[1:]:
-        found = json.loads(Path(source).read_text(encoding="utf-8"))
-        for measured in found if isinstance(found, list) else [found]:
-            into_document(measured)
+    write_pages()

@@ -27,7 +27,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands do, before
 import numpy as np
 from scipy.io import loadmat
 
-from benchmarks import datasets, judge
+from benchmarks import datasets, judge, table
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.typing import Array
@@ -163,9 +163,9 @@ def _ns(stamp_s: float) -> int:
     return round(stamp_s * 1e9)
 
 
-def run(drive: Drive) -> GraphSlam:
-    """The pipeline after the whole drive."""
-    slam = GraphSlam(Config.from_mapping(_SETTINGS))
+def run(drive: Drive, more: Mapping[str, Any] | None = None) -> GraphSlam:
+    """The pipeline after the whole drive, with more settings than those above."""
+    slam = GraphSlam(Config.from_mapping({**_SETTINGS, **(more or {})}))
     for m in drive.measurements():
         slam.process(m)
     slam.process(Control("optimize"))
@@ -176,19 +176,24 @@ def main() -> None:
     """The programme."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", nargs="?", type=Path, default=datasets.PARK, metavar="FOLDER")
-    drive = read_drive(parser.parse_args().folder)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set a parameter")
+    table.add_write(parser)
+    args = parser.parse_args()
+    drive = read_drive(args.folder)
     begun_s = time.process_time()
-    slam = run(drive)
+    slam = run(drive, dict(text.split("=", 1) for text in args.set))
     cpu_s, fixes, view = time.process_time() - begun_s, drive.quiet_fixes(), slam.view
     estimate = Track.of_laser(view.sighting_poses.stamps_ns * 1e-9, view.sighting_trajectory())
-    for name, path in (("estimate", estimate), ("odometry", drive.path_of_odometry())):
+    rows = list[table.Row]()
+    for name, path in ((f"estimate {' '.join(args.set)}".strip(), estimate), ("odometry", drive.path_of_odometry())):
         error = judge.distances(path.at(fixes.stamps_s), fixes.positions)
-        rms = np.sqrt(np.mean(error**2))
-        print(f"{name}: median {np.median(error):.2f} m, rms {rms:.2f} m, 95 % within {np.percentile(error, 95):.2f} m")
-    print(
-        f"{len(fixes.stamps_s)} of {len(drive.gps.stamps_s)} fixes; {len(view.landmarks)} landmarks; {cpu_s:.0f} s CPU"
+        quantiles = np.percentile(error, [50, 95]).tolist()
+        rms = float(np.sqrt(np.mean(error**2)))
+        rows.append({"path": name, "median (m)": quantiles[0], "rms (m)": rms, "95 % within (m)": quantiles[1]})
+    note = (
+        f"{len(fixes.stamps_s)} of {len(drive.gps.stamps_s)} fixes, {len(view.landmarks)} landmarks, {cpu_s:.0f} s CPU"
     )
-    print(slam.counters.as_dict())
+    table.finish("victoria_park", rows, write=args.write, note=note)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from lifecycle_msgs.srv import ChangeState
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -219,23 +218,6 @@ class Robot:
 
     def _take(self, message: UInt64) -> None:
         self._received = message.data
-
-
-def transitions(*names: str) -> Iterator[float]:
-    """Ask the node for transitions; yields the seconds that each took."""
-    manager = Node("manager", enable_rosout=False)
-    client = manager.create_client(ChangeState, f"{_NAME}/change_state")
-    _until(client.service_is_ready, "service of the node")
-    for name in names:
-        request: Any = ChangeState.Request()
-        request.transition.label = name
-        start_s = time.monotonic()
-        future = client.call_async(request)
-        rclpy.spin_until_future_complete(manager, future, timeout_sec=_PATIENCE_S)
-        if not future.done() or not future.result().success:
-            raise SystemExit(f"{name} failed")
-        yield time.monotonic() - start_s
-    manager.destroy_node()
 
 
 def _paced(part: Iterator[BagMessage], pace: float) -> Iterator[BagMessage]:

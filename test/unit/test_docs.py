@@ -1,4 +1,4 @@
-"""Each link within the documents leads to a file and a heading, and each case of reliability.md has a test."""
+"""Links lead to a file and a heading, figures are those of docs/figures, and each case of reliability.md has a test."""
 
 import fnmatch
 import re
@@ -8,6 +8,9 @@ from urllib.parse import unquote
 
 from places import ROOT
 from rows import each
+
+from benchmarks import table
+from benchmarks.figure_rows import read_table
 
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 _INLINE = re.compile(r"\]\(\s*<?([^()\s<>]+(?:\([^()\s]*\)[^()\s]*)*)>?(?:\s+[\"'][^)]*)?\s*\)")
@@ -79,3 +82,33 @@ def test_every_case_of_what_can_go_wrong_is_told_with_a_test_that_is_there_or_a_
             told += [f"{letter}{k}" for letter, first, last in cases for k in range(int(first), int(last or first) + 1)]
     assert [case for case, times in Counter(told).items() if times > 1] == []  # a code names one row
     assert set(told) >= {f"{letter}{k}" for letter, count in CASES.items() for k in range(1, count + 1)}
+
+
+def test_every_table_of_figures_is_that_of_its_csv_whose_rows_have_commands():
+    text = "".join(page.read_text(encoding="utf-8") for page in table.PAGES)
+    assert table.rendered(text) == text, "python -m benchmarks.table"
+    shown = set(re.findall(r"<!-- (\S+): begin -->", text))
+    assert shown == {file.stem for file in table.FIGURES.glob("*.csv")} - {"figures"}
+    assert all(row[table.COMMAND] and row[table.MEASURED] for name in shown for row in table.read(name))
+
+
+def test_what_the_front_page_claims_is_what_the_tables_say():
+    online = {row["graph"]: row for row in table.read("online") if row["part"]}
+    of_125, of_9 = (online.pop(name) for name in ("smallGrid3D", "tinyGrid3D"))
+    parts = [row["part"] for row in online.values()]
+    off = max(float(row["of best, ours"]) for row in (*online.values(), of_125))
+    kills = re.search(r"`kill -9`.* \| ([\d,]+) \|", (ROOT / "docs/reliability.md").read_text())[1]
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    for claim in (
+        f"it takes {min(parts)} to {max(parts)} of the CPU time",
+        f"(Victoria Park {online['victoria_park']['part']}, M3500 {online['M3500']['part']})",
+        f"on a graph of 125 poses {of_125['part']}, and on one of 9 poses {of_9['part']}",
+        f"at most {100 * off - 100:.2f} % above",
+        f"on the 9 poses {100 * float(of_9['of best, ours']) - 100:.2f} %",
+        f"killed {kills} times",
+    ):
+        assert claim in text
+    for row in table.read("robots"):
+        for column, name in (("estimate (m)", "position"), ("landmarks (m)", "map")):
+            figure = read_table()[f"MR.CLAM 7, robot {row['robot']}, ids known: {name}"]
+            assert row[column] == f"{figure.value:.3f}"

@@ -6,7 +6,7 @@ from condensed_run import SEED, WINDOW, bounded, condensed_run
 from reliability import times
 
 from benchmarks.hall import STEP_S, config, hall, measurements, without_ids
-from benchmarks.judge import fitted, rms
+from benchmarks.judge import rms
 from graph_slam_ros.analysis.explain import explain_edge, explain_run
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
@@ -25,6 +25,7 @@ from graph_slam_ros.slam.association import hindsight
 from graph_slam_ros.slam.association.hindsight import FrozenScans, explained
 from graph_slam_ros.slam.association.presence_check import Presence
 from graph_slam_ros.slam.doubt.record import Doubt
+from graph_slam_ros.slam.landmarks.rotations import aligned
 from graph_slam_ros.slam.lifelong.state import Left
 
 KEYFRAMES, MORE = 700, times(800, 900)
@@ -281,7 +282,7 @@ def assert_each_landmark_is_there_once(view, world, least):
     there = view.solver.estimate([mark.vertex for mark in view.landmarks.values() if not mark.is_tentative])
     space = world.space
     true = np.stack(space.group.act(space.group.inverse(world.poses[0]), tuple(world.points.T)), axis=-1)
-    turn, shift = fitted(there, true[np.linalg.norm(there[:, None] - true[None], axis=2).argmin(axis=1)])
+    turn, shift = aligned(there, true[np.linalg.norm(there[:, None] - true[None], axis=2).argmin(axis=1)])
     apart = np.linalg.norm((there @ turn.T + shift)[:, None] - true[None], axis=2)
     assert apart.min(axis=1).max() < 0.5
     assert len(set(apart.argmin(axis=1).tolist())) == len(there) >= least

@@ -12,7 +12,6 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.maps.edit import source_hash
-from graph_slam_ros.measurements.edits import ACTIONS
 from graph_slam_ros.runs.trajectory import read_landmarks, read_tum
 from graph_slam_ros.tools.report.contents import read_contents
 from graph_slam_ros.tools.view.workbench import Workbench
@@ -119,11 +118,6 @@ def test_edits_of_the_path_are_tried_as_they_are_saved_and_decisions_that_change
     changed = [[edge, was, after[edge]] for edge, was in before.items() if was != after[edge]]
     own = {edge for done in saved.view.edits for edge in done.edges}
     assert attempted["changes"] == [one for one in changed if one[0] not in own] != []
-
-
-def test_the_page_has_all_kinds_of_edits(faulty):
-    kinds = {one["do"]: [field["key"] for field in one["fields"]] for one in faulty.work.page_data["kinds"]}
-    assert kinds == {do: list(action.known) for do, action in ACTIONS.items()}
 
 
 def test_what_is_no_what_if_is_refused_in_one_line(faulty):
