@@ -89,7 +89,8 @@ def _write_bag(args: argparse.Namespace, faults: list[Fault]) -> None:
     wrong = simulation.write_faulty_bag(recording, args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
     if faults:
-        _write_table(args.out, WrongMessage, wrong, "measurements")
+        whole = ", ".join(fault.kind for fault in faults if fault.is_of_messages)
+        _write_table(args.out, WrongMessage, wrong, "measurements", f"; of whole topics: {whole}" if whole else "")
 
 
 def _write_graph(args: argparse.Namespace, faults: list[Fault], truth_file: Path) -> None:
@@ -116,9 +117,9 @@ def _write_graph(args: argparse.Namespace, faults: list[Fault], truth_file: Path
         console.show(f"wrote {truth_file}: the true poses")
 
 
-def _write_table(out: Path, of: type, wrong: list[Any], what: str) -> None:
+def _write_table(out: Path, of: type, wrong: list[Any], what: str, more: str = "") -> None:
     simulation.write_table(_companion(out, ".faults.csv"), of, wrong)
-    console.show(f"wrote {_companion(out, '.faults.csv')}: {len(wrong)} {what} are wrong")
+    console.show(f"wrote {_companion(out, '.faults.csv')}: {len(wrong)} {what} are wrong{more}")
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:
