@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.findings.finding import Finding
@@ -23,9 +22,9 @@ if TYPE_CHECKING:
 _WIDTH = 100
 
 
-def check_options(sub: CommandParser) -> None:
+def check_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``check``."""
-    sub.codes = f"{CODES} 4: something above a note was found."
+    sub.codes = f"{arguments.CODES} 4: something above a note was found."
     arguments.add_inputs(sub)
     sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
     arguments.add_json(sub)
@@ -105,11 +104,11 @@ def _amount(value: float, unit: str) -> str:
 # -- calibrate ---------------------------------------------------------------------------------------------------------
 
 
-def calibrate_options(sub: CommandParser) -> None:
+def calibrate_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``calibrate``."""
     arguments.add_inputs(sub)
     arguments.add_json(sub)
-    sub.codes = f"{CODES} 4: something is to be corrected."
+    sub.codes = f"{arguments.CODES} 4: something is to be corrected."
     about = "auto (default: odometry's factors, clocks, yaws; of ranges alone their factor and offset), or some of "
     about += f"{', '.join(GROUPS)}: what is estimated"
     sub.add_argument("--groups", default=AUTO, help=about)

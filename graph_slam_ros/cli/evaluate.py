@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 
-def evaluate_options(sub: CommandParser) -> None:
+def evaluate_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``evaluate``."""
     arguments.add_run(sub)
     arguments.add_truth(sub, required=True)

@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
@@ -17,9 +16,9 @@ _SHOWN = 10  # edges that fit worse
 _NO_SOLUTION = "not a solution: the solver did not converge. What was let in contradicts all else"
 
 
-def explain_options(sub: CommandParser) -> None:
+def explain_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``explain``."""
-    sub.codes = f"Edges have the ids of the run's ledger. {CODES}"
+    sub.codes = f"Edges have the ids of the run's ledger. {arguments.CODES}"
     arguments.add_run(sub)
     about = "id of an edge or name of a landmark (landmark:7 if the name is a number); default: the whole run"
     sub.add_argument("edge", nargs="?", metavar="EDGE", help=about)

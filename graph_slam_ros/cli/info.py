@@ -5,7 +5,7 @@ import textwrap
 from pathlib import Path
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.cli.usage import CommandParser
+from graph_slam_ros.cli.arguments import CommandParser
 from graph_slam_ros.messages.inputs import CONVERTERS
 from graph_slam_ros.messages.inputs.plugins import described
 from graph_slam_ros.overview.contents import TopicContents

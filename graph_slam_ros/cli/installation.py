@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterator
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.cli.usage import CommandParser
+from graph_slam_ros.cli.arguments import CommandParser
 from graph_slam_ros.config.config import parameters
 from graph_slam_ros.config.parameter import Parameter
 from graph_slam_ros.errors import GraphSlamError

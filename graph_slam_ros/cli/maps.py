@@ -6,16 +6,15 @@ from pathlib import Path
 
 from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.evaluate import suggest_next
-from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 _FILES = ("tum", "g2o", "mcap")
 _PICTURES = ("png", "gif")
 
 
-def diff_options(sub: CommandParser) -> None:
+def diff_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``map diff``."""
-    sub.codes = f"{CODES} 4: they differ."
+    sub.codes = f"{arguments.CODES} 4: they differ."
     sub.add_argument("a", type=Path, metavar="A", help="run folder")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
     arguments.add_json(sub)
@@ -35,7 +34,7 @@ def diff(args: argparse.Namespace) -> int:
     return console.report_losses(losses) or (console.DONE if found.is_same else console.DIFFERENT)
 
 
-def merge_options(sub: CommandParser) -> None:
+def merge_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``map merge``."""
     sub.add_argument("a", type=Path, metavar="A", help="run folder; the result has its map frame and configuration")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
@@ -61,9 +60,9 @@ def merge(args: argparse.Namespace) -> int:
     return console.report_losses(done.losses, moved)
 
 
-def edit_options(sub: CommandParser) -> None:
+def edit_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``map edit``."""
-    sub.codes = f"explain RUN prints the ids of edges and the names of landmarks; so does ledger.csv. {CODES}"
+    sub.codes = f"explain RUN prints the ids of edges and the names of landmarks; so does ledger.csv. {arguments.CODES}"
     sub.more = _kinds_of_edits
     arguments.add_run(sub)
     sub.add_argument("--plan", type=Path, metavar="FILE", help="JSON file with the edits")
@@ -108,7 +107,7 @@ def edit(args: argparse.Namespace) -> int:
     return console.report_losses(done.losses, done.warnings)
 
 
-def freeze_options(sub: CommandParser) -> None:
+def freeze_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``map freeze``."""
     arguments.add_run(sub)
     arguments.add_out(sub)
@@ -127,7 +126,7 @@ def freeze(args: argparse.Namespace) -> int:
     return console.report_losses(summary["losses"])
 
 
-def export_options(sub: CommandParser) -> None:
+def export_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``map export``."""
     arguments.add_run(sub)
     about = (

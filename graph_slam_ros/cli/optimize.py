@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
@@ -26,9 +25,9 @@ _RIGHT = "? "  # ends the question of a doubt that one mistake explains
 _OTHER_TAG = "give what is lost a tag that is read, and its information (docs/graphs.md)"
 
 
-def optimize_options(sub: CommandParser) -> None:
+def optimize_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``optimize``."""
-    sub.codes = f"{CODES} With --certify: 4 not certified, 5 it does not apply; 3 goes first."
+    sub.codes = f"{arguments.CODES} With --certify: 4 not certified, 5 it does not apply; 3 goes first."
     sub.add_argument("graph", type=Path, metavar="GRAPH", help="file of a graph")
     about = "method of optimisation; gn (default) is damped only if it does not converge"
     sub.add_argument("--method", choices=("gn", "lm", "dogleg"), default="gn", help=about)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli.usage import CommandParser
+from graph_slam_ros.cli.arguments import CommandParser
 
 
 class Command:

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.evaluate import draw, suggest_next
-from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
     from graph_slam_ros.slam import Config
 
 
-def replay_options(sub: CommandParser) -> None:
+def replay_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``replay``."""
     arguments.add_inputs(sub, "file or folder of a recording, or a run folder")
     arguments.add_out(sub, required=False)  # not with --ros and --node
@@ -110,7 +109,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     return code
 
 
-def recover_options(sub: CommandParser) -> None:
+def recover_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``recover``."""
     arguments.add_run(sub)
     arguments.add_out(sub, required=False, default="RUN itself")

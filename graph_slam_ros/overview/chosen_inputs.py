@@ -42,14 +42,8 @@ class Inputs:
 def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
     """The topic of each input: the named one, else the configured one, else the only one of its type.
 
-    Parameters
-    ----------
-    odometry, landmarks : topics of the first input that is used so, whatever is configured
-
-    Raises
-    ------
-    BagError
-        A named topic does not exist or has another type, or there is none; the topics that exist are listed.
+    ``odometry`` and ``landmarks`` are topics of the first input that is used so. Raises BagError with the topics that
+    exist: a named one does not, or has another type, or there is none.
     """
     named = {"odometry": odometry, "landmarks": landmarks}
     by_name = {settings.name: settings for settings in config.sources}

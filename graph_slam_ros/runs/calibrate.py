@@ -77,11 +77,6 @@ def calibrate(
     groups : what is estimated, words of ``GROUPS`` or ``auto``
     odometry, landmarks : topics, instead of those that ``info`` chooses
     progress : wraps the sequence of messages
-
-    Raises
-    ------
-    GraphSlamError
-        The recording or an input cannot be used, or has no keyframe; a group is unknown, or one scale with another.
     """
     path, bag = Path(path), open_bag(Path(path))
     suggested = SuggestedInputs(bag, path, settings or {}, odometry, landmarks)

@@ -67,11 +67,6 @@ def check(
     odometry, landmarks : topics, instead of those that ``info`` chooses
     quick : leave out what needs a replay and a fit
     progress : wraps the sequence of messages
-
-    Raises
-    ------
-    GraphSlamError
-        The recording, a topic or a parameter cannot be used.
     """
     path, settings = Path(path), dict(settings or {})
     bag = open_bag(path)

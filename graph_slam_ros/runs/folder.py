@@ -57,10 +57,7 @@ class RunError(GraphSlamError):
 def is_run(folder: Path) -> bool:
     """Return whether a folder holds a run: its ``run.json`` says so, or that is lost, and it has a journal.
 
-    Raises
-    ------
-    RunError
-        The disk fails to tell: a run may be there, which nobody may take for another thing.
+    Raises RunError where the disk fails to tell: nobody may take a run for another thing.
     """
     if not folder.is_dir():
         return False
@@ -143,13 +140,7 @@ def _holds_something(folder: Path) -> bool:
 
 
 def summary_of(folder: Path) -> dict[str, Any]:
-    """The summary; empty where there is none, or no JSON in it.
-
-    Raises
-    ------
-    RunError
-        It is there and cannot be read: what it says must not be taken for missing.
-    """
+    """The summary; empty where there is none, or no JSON in it. Raises RunError where it is there and unreadable."""
     try:
         recorded = json.loads(read_text(folder / SUMMARY))
     except OSError as error:
@@ -265,14 +256,7 @@ def suggested_out(source: Path) -> Path:
 def check_room(folder: Path, source: Path | None = None, *, force: bool = False) -> None:
     """Refuse a folder that contains anything but a run that may be replaced, or the source that is about to be read.
 
-    Parameters
-    ----------
-    force : a run that holds something may be replaced, too
-
-    Raises
-    ------
-    RunError
-        Nothing was touched.
+    With ``force`` a run that holds something may be replaced, too. Raises RunError; nothing was touched.
     """
     try:
         if source is not None and folder.resolve() in (source.resolve(), source.resolve().parent):
@@ -346,12 +330,8 @@ def _numbered(folder: Path) -> dict[int, Path]:
 def room(folder: Path, *, force: bool = False) -> Iterator[None]:
     """Make a folder for a run, and have it for oneself; a run in it is replaced, if that is allowed.
 
-    From here on its ``run.json`` says that it is a run.
-
-    Raises
-    ------
-    RunError
-        Something else is there, or somebody else records there.
+    From here on its ``run.json`` says that it is a run. Raises RunError where something else is there, or where
+    somebody else records there.
     """
     check_room(folder, force=force)
     with contextlib.ExitStack() as held:

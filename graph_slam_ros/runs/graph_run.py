@@ -26,22 +26,10 @@ _SECOND_NS, _LARGEST_S = 10**9, 10**9
 
 
 def write_graph_run(solution: Solution, out: Path, name: str, *, force: bool = False) -> tuple[int, int]:
-    """Write a solved graph as a run: its closures are judged as those of a drive.
+    """Write the solved graph of a file as a run: its closures are judged as those of a drive.
 
-    What the solution holds is anchored, in its graph, too.
-
-    Parameters
-    ----------
-    name : of the file
-
-    Returns
-    -------
-    out, judged : measurements that are not in the map, and all that may be wrong
-
-    Raises
-    ------
-    RunError
-        It has no poses, odometry alone, or vertices that no run has.
+    What the solution holds is anchored, in its graph, too. Returns how many measurements are not in the map, and how
+    many may be wrong. Raises RunError: it has no poses, odometry alone, or vertices that no run has.
     """
     file, solver = solution.file, solution.solver
     graph = file.graph

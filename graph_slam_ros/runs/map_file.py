@@ -81,13 +81,7 @@ def write_map(file: Path, state: MapSnapshot) -> int:
 
 
 def read_map(folder: Path) -> MapSnapshot | None:
-    """The newest map of a run folder; None if there is none.
-
-    Raises
-    ------
-    FormatError
-        It is of another version, damaged, or no map.
-    """
+    """The newest map of a run folder, or None. Raises FormatError: it is of another version, damaged, or no map."""
     return _read(folder / MAP)
 
 

@@ -158,10 +158,8 @@ class RunRecorder:
     def flush(self) -> None:
         """Write accepted measurements and their results to disk, before any result is published.
 
-        Raises
-        ------
-        OSError
-            It is kept, and written by the next call that can; or the disk did not take what was flushed before.
+        Raises OSError: it is kept, and written by the next call that can; or the disk did not take what was flushed
+        before.
         """
         with self._writing:
             if self._is_ended:
@@ -247,13 +245,7 @@ class RunRecorder:
         self._mapping = None
 
     def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
-        """Write all results. Recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
-
-        Raises
-        ------
-        RunError
-            The folder cannot be written.
-        """
+        """Write all results. Recording may go on, in new parts. Returns the folder; raises RunError if it refuses."""
         try:
             with self._writing:
                 self._refuse_if_ended()
@@ -276,12 +268,7 @@ class RunRecorder:
     def leave(self, processed: int, keyframes: int, counters: Counters) -> int:
         """End the recording before everything was processed, and note that in the summary. Returns how many are left.
 
-        What was saved until now stays; ``complete`` makes the results of the whole.
-
-        Raises
-        ------
-        OSError
-            The disk refuses it.
+        What was saved until now stays; ``complete`` makes the results of the whole. Raises OSError.
         """
         unprocessed = max(0, self.accepted - processed)
         with self._writing:
@@ -298,13 +285,7 @@ class RunRecorder:
         return unprocessed
 
     def close(self) -> None:
-        """End the recording, and release the folder.
-
-        Raises
-        ------
-        OSError
-            What the disk did not take is kept: the next ``flush`` or ``close`` tries again.
-        """
+        """End the recording, and release the folder. Raises OSError; the next ``flush`` or ``close`` tries again."""
         with self._writing:
             self._end_parts()
             self._end()

@@ -65,11 +65,6 @@ class RecordedRuns:
     ----------
     count : of the messages
     counted : what was counted when each run but the last ended
-
-    Raises
-    ------
-    BagError
-        A recorded definition is not what we can use.
     """
 
     def __init__(

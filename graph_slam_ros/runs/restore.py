@@ -39,14 +39,8 @@ Stopwatch = Callable[[], dict[str, float]]
 def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapSnapshot:
     """The map of a run: the newest that was written, with the rest of its journal; or by repeating the drive.
 
-    Parameters
-    ----------
-    counters : added to them is what the run has counted, by its summary and by what is processed here
-
-    Raises
-    ------
-    RunError, FormatError
-        There is none, or it cannot be read.
+    What the run has counted, by its summary and by what is processed here, is added to ``counters``. Raises RunError
+    or FormatError: there is no map, or it cannot be read.
     """
     space = run_config(folder).space
     warmup(dimensions=space.dimensions)
@@ -118,14 +112,8 @@ def of_all(folder: Path) -> str:
 def restored(folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False) -> GraphSlam:
     """The map of a run; see ``map_of``. Losses name its folder.
 
-    Parameters
-    ----------
-    whole : whether all keyframes are needed: where visits were condensed, the drive is repeated from its journal
-
-    Raises
-    ------
-    RunError
-        The whole map is asked for, and the drive began in a map with condensed visits.
+    The ``whole`` map has all keyframes: where visits were condensed, the drive is repeated from its journal. Raises
+    RunError, too, where that drive began in a map with condensed visits.
     """
     lost = len(losses)
     state = map_of(folder, losses, counters)
@@ -181,10 +169,7 @@ def record_run(
     more : returns what else is in the summary, when all is processed
     force : a run in the folder may be replaced
 
-    Raises
-    ------
-    KeyboardInterrupt
-        Nothing of it is left in the folder; so it is whatever is raised before the first measurement is accepted.
+    After a KeyboardInterrupt nothing of it is left, nor after an error before the first measurement is accepted.
     """
     took = took or stopwatch()
     recorder: RunRecorder | None = None
@@ -227,10 +212,7 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
 def complete(folder: Path) -> Summary:
     """Write the results of all measurements of a run into its folder. Its recordings stay as they are.
 
-    Raises
-    ------
-    RunError
-        Somebody else has the folder, or its map cannot be solved.
+    Raises RunError: somebody else has the folder, or its map cannot be solved.
     """
     took, losses = stopwatch(), list[str]()
     try:
@@ -247,16 +229,9 @@ def complete(folder: Path) -> Summary:
 
 
 def save_copy(view: MapView, out: Path, folder: Path) -> None:
-    """Write the map of a pipeline as a run of its own, which others can load. The pipeline goes on unchanged.
+    """Write the map of a pipeline, whose own run is saved in ``folder``, as another run. The pipeline goes on as it is.
 
-    Parameters
-    ----------
-    folder : of its own run, which is saved
-
-    Raises
-    ------
-    RunError
-        Something of that name is there already, or there is no map that is solved. Nothing was written.
+    Raises RunError, and writes nothing: something of that name is there, or there is no map that is solved.
     """
     if os.path.lexists(out):
         raise RunError(f"{out.name}: is there already, and nothing is replaced: choose another name")

@@ -377,10 +377,7 @@ class SuggestedInputs:
     def inputs(self, config: Config) -> Inputs:
         """The topics of the inputs of a configuration: named, suggested, configured, or the only ones of their types.
 
-        Raises
-        ------
-        BagError
-            A topic does not exist or has another type, or there is none.
+        Raises BagError: a topic does not exist or has another type, or there is none.
         """
         used = {one.name for one in config.sources if one.use != "none"}
         topics = {name: topic for name, topic in self._topics.items() if name in used}
@@ -397,16 +394,8 @@ def _topic_of(given: Mapping[str, Any], name: str) -> str | None:
 def suggestion_for_other_types(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:
     """Return how to replay a recording whose odometry or landmarks are of other types than the usual, or are fixes.
 
-    None where they are usual, where other inputs are configured, or where there is nothing else in it.
-
-    Parameters
-    ----------
-    odometry : its topic; None: the suggested one
-
-    Raises
-    ------
-    BagError
-        It cannot be read.
+    None where they are usual, where other inputs are configured, or where there is nothing else in it. ``odometry`` is
+    its topic, or else the suggested one. Raises BagError: it cannot be read.
     """
     if config.inputs.names != Config().inputs.names:
         return None
@@ -423,12 +412,7 @@ def suggestion_for_other_types(path: Path, config: Config, odometry: str | None 
 
 
 def unused_topics(path: Path, used: Collection[str]) -> list[str]:
-    """Topics of a recording that have odometry, landmarks or fixes by their type, and that no input was read from.
-
-    Parameters
-    ----------
-    used : topics of the inputs
-    """
+    """Topics that have odometry, landmarks or fixes by their type, and are none of those that inputs have used."""
     topics = (
         one for one in open_bag(path).topics.values() if one.count and one.type in (*OF_LANDMARKS, ODOMETRY, GNSS)
     )

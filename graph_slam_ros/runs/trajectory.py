@@ -94,11 +94,7 @@ def read_rows(path: Path, *, follow: bool = False) -> Trajectory:
     """Poses of a TUM file in the order of its rows, which in a run's files are in the order of its keyframes.
 
     Commas may separate the numbers, stamps may be nanoseconds, and a header may name other columns (EuRoC, TUM-VI).
-
-    Raises
-    ------
-    GraphSlamError
-        No such file, nothing in it, or rows that are not eight numbers.
+    Raises GraphSlamError: no such file, nothing in it, or rows that are not eight numbers.
     """
     try:
         lines = read_text(path, follow=follow).splitlines()

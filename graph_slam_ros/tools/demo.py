@@ -11,7 +11,6 @@ from typing import Any
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.plots import draw_run
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
@@ -24,7 +23,7 @@ from graph_slam_ros.warmup import compile_all
 _BAG = Path(__file__).resolve().parents[2] / "data" / "demo.mcap"
 
 
-def demo_options(sub: CommandParser) -> None:
+def demo_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``demo``."""
     sub.add_argument(
         "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="folder for the results (default: runs/demo)"

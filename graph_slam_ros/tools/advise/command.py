@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser
 
 if TYPE_CHECKING:
     from graph_slam_ros.tools.advise.advice import Advice, Advisor
     from graph_slam_ros.tools.advise.weakness import Stretch, Weakness
 
 
-def advise_options(sub: CommandParser) -> None:
+def advise_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``advise``."""
     arguments.add_run(sub)
     sub.add_argument("--count", type=arguments.count, default=1, metavar="N", help="additions of a kind (default: 1)")

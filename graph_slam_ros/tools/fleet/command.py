@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 _NEEDED = ("dask", "distributed", "fsspec", "jinja2", "pyarrow")
@@ -21,7 +20,7 @@ def _check_installed() -> None:
         raise GraphSlamError(f"fleet needs {', '.join(missing)}: pip install 'graph_slam_ros[fleet]'")
 
 
-def replay_options(sub: CommandParser) -> None:
+def replay_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``fleet replay``."""
     about = "recordings, folders of them, s3:// or gs:// addresses"
     sub.add_argument("recordings", nargs="+", metavar="BAG", help=about)
@@ -42,9 +41,9 @@ def replay_options(sub: CommandParser) -> None:
     sub.add_argument("--memory", type=arguments.positive, default=0.0, metavar="MIB", help=about)
 
 
-def compare_options(sub: CommandParser) -> None:
+def compare_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``fleet compare``."""
-    sub.codes = f"{CODES} 4: worse than --fail allows."
+    sub.codes = f"{arguments.CODES} 4: worse than --fail allows."
     sub.add_argument("old", type=Path, metavar="OLD", help="folder of the earlier fleet")
     sub.add_argument("new", type=Path, metavar="NEW", help="folder of the later fleet")
     about = "exit with 4 beyond it: METRIC>NUMBERx or METRIC>NUMBER"

@@ -5,11 +5,10 @@ import gc
 from pathlib import Path
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 
-def report_options(sub: CommandParser) -> None:
+def report_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``report``."""
     arguments.add_run(sub)
     sub.add_argument(

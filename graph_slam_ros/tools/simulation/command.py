@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError, did_you_mean, similar_file
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.g2o_writer import write_g2o
@@ -20,7 +19,7 @@ from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WORLDS, Fault, WrongLi
 from graph_slam_ros.tools.simulation.options import lines_about
 
 
-def simulate_options(sub: CommandParser) -> None:
+def simulate_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``simulate``."""
     sub.more = options_of_worlds
     about = "name of a world (city, sphere: a graph), or the file of a graph or recording"

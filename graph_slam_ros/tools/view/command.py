@@ -7,13 +7,12 @@ import os
 import sys
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 _NEEDS = "starlette", "uvicorn"
 
 
-def view_options(sub: CommandParser) -> None:
+def view_options(sub: arguments.CommandParser) -> None:
     """Add the options of ``view``."""
     arguments.add_run(sub)
     arguments.add_shown(sub)
