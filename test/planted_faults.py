@@ -14,7 +14,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
-from graph_slam_ros.messages.from_msg import OwnDecoder
+from graph_slam_ros.messages.from_msg import own_decoder
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.tools.simulation import Drive, Fault, put_faults, simulate, write_bag
 from graph_slam_ros.tools.simulation.drive import Sightings
@@ -27,7 +27,7 @@ class Places:
     """Where landmarks are, and how the robot points, by the truth of a recording."""
 
     def __init__(self, drive):
-        decode = OwnDecoder("geometry_msgs/msg/PoseStamped")
+        decode = own_decoder("geometry_msgs/msg/PoseStamped")
         truth = [decode(m.content) for m in drive.messages if m.topic == TRUTH]
         self.stamps = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in truth])
         at = np.array([(p.position.x, p.position.y, p.orientation.z, p.orientation.w) for p in (m.pose for m in truth)])

@@ -5,7 +5,7 @@ A ``Collector`` gets each decoded message, and the measurements that the convert
 """
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -17,7 +17,7 @@ from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import AngularVelocity, Control, Fix, Measured, Odometry, Sighting, Sightings
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.detections import names_of
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
@@ -28,7 +28,6 @@ _MOST = 200_000  # messages of each topic that are collected
 _TWIST = (0, 7, 14, 21, 28, 35)  # places in a covariance
 _UNKNOWN_M = 30.0  # so large is the sigma of an axis that a detector does not know
 _OF_ODOMETRY, _OF_GYRO, _OF_FIX, _OF_SIGHTING = 19, 7, 4, 6  # numbers of each
-Decoder = Callable[[bytes], Any]
 SomeTopicData = TypeVar("SomeTopicData", bound="TopicData")
 
 
@@ -317,7 +316,6 @@ class Collector:
         self.begin_anew()
         self._links: dict[tuple[str, str], None] = {}
         self._transforms = Transforms()
-        self._last: Any = None
 
     def begin_anew(self) -> None:
         """Drop all numbers; frames, and the places of sensors, stay."""
@@ -329,27 +327,15 @@ class Collector:
         self._read, self._path = _Rows(1, _OF_ODOMETRY), _Rows(1, self._config.space.pose.size)
         self._gyro = _Rows(1, _OF_GYRO)
 
-    def decoder(self, decode: Decoder) -> Decoder:
-        """The same decoder, of which the message is remembered until it is collected."""
-        if isinstance(decode, OwnDecoder):
-            return OwnDecoder(decode.type, self._remember)
-
-        def decoded(cdr: bytes) -> Any:
-            self._last = decode(cdr)
-            return self._last
-
-        return decoded
-
-    def leave_out(self) -> None:
-        """Forget the message that was decoded last: it is not collected, but what is measured is."""
-        self._last = None
-
-    def _remember(self, message: Any) -> None:
-        self._last = message
-
-    def add(self, topic: str, names: Iterable[str], log_ns: int, measured: Iterable[Measured | Control]) -> None:
-        """Collect a message: the one that was decoded last, of these inputs, and what became of it."""
-        message, self._last = self._last, None
+    def add(
+        self,
+        topic: str,
+        names: Iterable[str],
+        log_ns: int,
+        measured: Iterable[Measured | Control],
+        message: Any = None,
+    ) -> None:
+        """Collect a message of these inputs, if it was decoded and is not left out, and what became of it."""
         heights: dict[str, float] = {}
         if message is not None:
             self._add_message(topic, names, log_ns, message)
@@ -368,11 +354,9 @@ class Collector:
                     heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
                 self._sightings[m.topic].add(m, heights)
 
-    def add_run(self, topic: str, log_ns: Sequence[int], run: Sequence[Odometry]) -> None:
+    def add_run(self, topic: str, log_ns: Sequence[int], run: Sequence[Odometry], read: OdometryRun) -> None:
         """Collect messages that were converted at once: what was read of them, and the odometry of each."""
-        read, self._last = self._last, None
-        if type(read) is OdometryRun:
-            self._add_read(topic, log_ns, read)
+        self._add_read(topic, log_ns, read)
         if run[0].source == self._main:
             run = run[: self._path.room]
             self._path.add([m.stamp_ns for m in run], [x for m in run for x in m.T_odom_base])
@@ -396,7 +380,6 @@ class Collector:
 
     def _add_read(self, topic: str, log_ns: Sequence[int], read: OdometryRun) -> None:
         """Collect odometry that was not decoded."""
-        read = read.first(len(log_ns))
         stamps_ns = (read.sec * 1_000_000_000 + read.nanosec).tolist()
         if topic in self._topics:
             self._topics[topic].add(log_ns, stamps_ns, read.frame_id)

@@ -8,7 +8,7 @@ import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -35,23 +35,10 @@ _TF_BUFFER_NS = 10 * 10**9  # transforms of /tf are kept for so long, as tf2 doe
 _POSE_NUMBERS = 7 + 36  # of a geometry_msgs/PoseWithCovariance
 
 
-class OwnDecoder:
-    """A decoder from CDR bytes to a message object of our own type store.
-
-    Parameters
-    ----------
-    note : called with each message, and with what was read of one that was not decoded
-    """
-
-    def __init__(self, type_name: str, note: Callable[[Any], object] = lambda message: None) -> None:
-        self.type, self.note = type_name, note
-        self._store = typestore()
-
-    def __call__(self, cdr: bytes) -> Any:
-        """Decode a message."""
-        message = self._store.deserialize_cdr(cdr, self.type)
-        self.note(message)
-        return message
+@cache
+def own_decoder(type_name: str) -> Decoder:
+    """A decoder from CDR bytes to a message object of our own type store; the same each time."""
+    return partial(typestore().deserialize_cdr, typename=type_name)
 
 
 def is_correction(cdr: bytes, map_frame: str) -> bool:
@@ -105,6 +92,7 @@ class MessageConverter:
     Attributes
     ----------
     on_fault : is called with the first error of a plugin in each input, in one line
+    decoded : the last message, or what was read of several at once; None where it could not be decoded
 
     Raises
     ------
@@ -115,6 +103,7 @@ class MessageConverter:
     def __init__(self, config: Config, counters: Counters, decoders: Mapping[str, Decoder] | None = None) -> None:
         self._config, self._counters, self._decoders = config, counters, dict(decoders or {})
         self.on_fault: Callable[[str], object] = lambda line: None
+        self.decoded: Any = None
         self._transforms = Transforms(_TF_BUFFER_NS, partial(counters.count, TF, "far_in_time"))
         self._links, self._awaits_stamp = 0, False  # of the last try of what waits
         self._inputs: dict[str, _Input] = {}
@@ -133,12 +122,12 @@ class MessageConverter:
 
     def _add(self, settings: InputConfig, type_name: str, use: str, convert: Callable[..., Any]) -> None:
         name, source = settings.name, InputContext(settings, use, self._config, self._transforms, self._origin)
-        decode = self._decoders.get(type_name) or OwnDecoder(type_name)
+        decode = self._decoders.get(type_name) or own_decoder(type_name)
         one = self._inputs[name] = _Input(source, decode, convert)
         if use == "odometry":
             refuse = (partial(self._counters.count, name, reason) for reason in ("other_publisher", "future"))
             one.publisher = OnePublisher(self._config.odometry.timeout_s, *refuse)
-            if type_name == odometry.TYPE and isinstance(decode, OwnDecoder):  # else its bytes may have other places
+            if type_name == odometry.TYPE and decode is own_decoder(type_name):  # else its bytes may have other places
                 one.reader = OdometryReader()
 
     def convert(self, name: str, cdr: bytes) -> list[Measured]:
@@ -146,7 +135,8 @@ class MessageConverter:
         one = self._inputs[name]
         self._counters.received[name] += 1
         try:
-            message = one.decode(cdr)
+            self.decoded = None
+            self.decoded = message = one.decode(cdr)
         except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
             self._counters.count(name, "undecodable")
             return []
@@ -192,8 +182,7 @@ class MessageConverter:
         self._count_tally(one.source)
         self._counters.received[name] += count
         self._transforms.now_ns = max(run[count - 1].stamp_ns, self._transforms.now_ns or 0)
-        if isinstance(one.decode, OwnDecoder):
-            one.decode.note(read.first(count))
+        self.decoded = read.first(count)
         return run[:count]
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:

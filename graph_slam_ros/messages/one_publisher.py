@@ -9,9 +9,9 @@ second case odometry has jumped.
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import combinations, pairwise
-from typing import Any
+from operator import attrgetter
 
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
@@ -29,34 +29,34 @@ _NOISY, _NOISIEST = 3.0, 2.5  # of the usual misfit, and at most
 _MOST_LABELS = 8
 _USUAL_NS = 200_000_000  # period of a track that has only one pose
 _REMEMBERED, _FORGOTTEN_NS = 4, 2_000_000_000
-_MOST_HELD, _MOST_SINCE, _MOST_SINGLE = 100, 1000, 5
+_MOST_NEW, _MOST_WAITING, _MOST_SINGLE = 100, 1000, 5
 
 
-@dataclass(slots=True, eq=False)
 class _Track:
     """A sequence of poses that continue one another.
 
+    Parameters
+    ----------
+    first : its first message
+    label : source under which its messages are used; empty before they are
+
     Attributes
     ----------
-    label : source under which its messages are used; empty before they are
     past : stamp and pose of the last messages, by ascending stamp
     count : messages so far
-    first_ns : stamp of its first message
+    waiting : its messages that are neither used nor refused
     is_established : whether it is another publisher's, which goes on beside the one in use
-    since : its messages since the last of the track in use, and one before
     """
 
-    label: str = ""
-    past: deque[tuple[int, Numbers]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
-    count: int = 0
-    first_ns: int = 0
-    is_established: bool = False
-    since: deque[Odometry] = field(default_factory=deque)
+    def __init__(self, first: Odometry, label: str = "") -> None:
+        self.label, self.count, self.is_established = label, 0, False
+        self.past: deque[tuple[int, Numbers]] = deque(maxlen=_REMEMBERED)
+        self.waiting: deque[Odometry] = deque()
+        self.add(first)
 
     def add(self, m: Odometry) -> None:
         """Add a message. One that is not newer does not change the prediction."""
         self.count += 1
-        self.first_ns = self.first_ns or m.stamp_ns
         if not self.past or m.stamp_ns > self.past[-1][0]:
             self.past.append((m.stamp_ns, m.T_odom_base))
 
@@ -118,7 +118,6 @@ class OnePublisher:
         self._timeout_ns, self._refuse = round(timeout_s * 1e9), refuse
         self._leap = StampLeap[Odometry](refuse_leap)
         self._tracks: list[_Track] = []  # the first is in use
-        self._held: deque[tuple[_Track, Odometry]] = deque()  # of tracks that are neither in use nor settled
         self._labels = 1
         self._usual = 0.0  # misfit of the odometry in use
 
@@ -127,9 +126,9 @@ class OnePublisher:
         if self._goes_on(m):
             return [m]
         newest_ns, room_ns = m.stamp_ns, _GAP_NS
-        if self._tracks and (used := self._tracks[0]).past:
-            newest_ns = min(m.stamp_ns, used.newest_ns)
-            room_ns = max(_GAP_NS, round(_GAP_PERIODS * used.period_ns))
+        if self._tracks:
+            newest_ns = min(m.stamp_ns, self._tracks[0].newest_ns)
+            room_ns = max(_GAP_NS, round(_GAP_PERIODS * self._tracks[0].period_ns))
         return [
             out
             for _, one in self._leap.accept(m.stamp_ns, m, newest_ns, room_ns)
@@ -140,12 +139,24 @@ class OnePublisher:
         """Accept messages from the first on, as far as each goes on with the only track; return how many."""
         return next((k for k, m in enumerate(run) if not self._goes_on(m)), len(run))
 
+    def finish(self) -> list[Odometry]:
+        """No more messages come: odometry has jumped to those that wait."""
+        new = [track for track in self._tracks[1:] if not track.is_established]
+        out = self._switch_to(max(new, key=attrgetter("newest_ns"))) if new else []
+        self.forget_time()
+        return out
+
+    def forget_time(self) -> None:
+        """Begin anew with the stamps, without tracks."""
+        self._leap.forget()
+        self._begin_anew()
+
     def _goes_on(self, m: Odometry) -> bool:
         """Return whether a message, now part of it, goes on with the only track: the quick answer for nearly all."""
-        if len(self._tracks) != 1 or self._held or self._leap.holds or self._labels > _MOST_LABELS:
+        if len(self._tracks) != 1 or self._leap.holds or self._labels > _MOST_LABELS:
             return False
         used = self._tracks[0]
-        if used.label != m.source or not used.past or not -_BACK_NS <= m.stamp_ns - used.newest_ns <= _GAP_NS:
+        if used.label != m.source or not -_BACK_NS <= m.stamp_ns - used.newest_ns <= _GAP_NS:
             return False
         if is_next := self._fits(used, m):
             used.add(m)
@@ -161,128 +172,109 @@ class OnePublisher:
     def _follow_publisher(self, m: Odometry) -> list[Odometry]:
         if self._labels > _MOST_LABELS:
             return [m]  # these are no publishers: whatever it is, it is used as it comes
-        if self._tracks and self._tracks[0].past and m.stamp_ns > self._tracks[0].newest_ns + _AHEAD_NS:
+        if self._tracks and m.stamp_ns > self._tracks[0].newest_ns + _AHEAD_NS:
             self._begin_anew()
         if not self._tracks:
-            self._tracks.append(_Track(m.source))
+            self._tracks.append(_Track(m, m.source))
+            return [m]
         used = self._tracks[0]
-        if used.past and m.stamp_ns < used.newest_ns - _BACK_NS:  # its place is decided by the order of stamps
+        if m.stamp_ns < used.newest_ns - _BACK_NS:  # its place is decided by the order of stamps
             others = (track for track in self._tracks if track.is_established)
             if used.misfit(m) <= 1.0 or all(track.misfit(m) > 1.0 for track in others):
                 return [m]
             self._refuse()
             return []
         track = self._continued(m)
-        track.add(m)
+        track.waiting.append(m)
         if track is used:
-            before = self._go_on(m) if self._held or len(self._tracks) > 1 else []
-            return [*before, _labelled(m, track)]
-        if track.is_established:
-            track.since.append(m)
+            return self._go_on(m)
+        silent_ns = track.newest_ns - track.waiting[0].stamp_ns
+        patience_ns = self._timeout_ns if track.is_established else max(_PERIODS * used.period_ns, _PATIENT_NS)
+        if track.count >= _SURE and silent_ns >= patience_ns:
             return self._switch_to(track)
-        self._held.append((track, m))
-        return self._jumped() if len(self._held) > _MOST_HELD or _has_jumped(track, used) else []
-
-    def finish(self) -> list[Odometry]:
-        """No more messages come: odometry has jumped to those that are kept."""
-        out = self._jumped() if self._held else []
-        self.forget_time()
-        return out
-
-    def forget_time(self) -> None:
-        """Begin anew with the stamps, without tracks."""
-        self._leap.forget()
-        self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        for track in self._tracks:
-            self._drop(track.since, 0)
-        self._drop(self._held, 0)
-        self._tracks.clear()
-
-    def _drop(self, some: deque[Any], kept: int) -> None:
-        """Use none of these, except perhaps the last few."""
-        while len(some) > kept:
-            some.popleft()
-            self._refuse()
+        self._drop(track, _MOST_WAITING)
+        new = [one for one in self._tracks[1:] if not one.is_established]
+        waiting = [m for one in new for m in one.waiting]
+        if len(waiting) <= _MOST_NEW:
+            return []
+        for one in new:  # there are too many to decide: all that waits is used
+            one.waiting.clear()
+        track.waiting.extend(sorted(waiting, key=attrgetter("stamp_ns")))
+        return self._switch_to(track)
 
     def _continued(self, m: Odometry) -> _Track:
-        """The track that a message continues best; a new one if it continues none."""
+        """The track that a message continues best, now with it; a new one if it continues none."""
         used = self._tracks[0]
-        if not used.past:
-            return used
         is_lone = len(self._tracks) == 1
         is_due = len(used.past) > 1 and m.stamp_ns - used.newest_ns <= _PERIODS * used.period_ns
-        if (is_lone or is_due) and self._fits(used, m):
-            return used
-        misfit, k = min((track.misfit(m), k) for k, track in enumerate(self._tracks))
-        if misfit <= 1.0:
-            return self._tracks[k]
-        if track := self._at_speed(m):
-            return track
-        self._tracks.append(_Track())
-        return self._tracks[-1]
+        track: _Track | None = used
+        if not ((is_lone or is_due) and self._fits(used, m)):
+            track = min(self._tracks, key=lambda one: one.misfit(m))
+            if track.misfit(m) > 1.0:
+                track = self._at_speed(m)
+        if track is None:
+            track = _Track(m)
+            self._tracks.append(track)
+        else:
+            track.add(m)
+        return track
 
     def _at_speed(self, m: Odometry) -> _Track | None:
         """The track of a message and two tracks of one pose each, for a robot that is fast from the start."""
         single = [track for track in self._tracks if len(track.past) == 1][-_MOST_SINGLE:]
         for a, b in combinations(single, 2):
-            joined = _Track(past=deque([*a.past, *b.past], maxlen=_REMEMBERED))
-            if a.newest_ns < b.newest_ns and joined.misfit(m) <= 1.0:
-                a.past, a.count = joined.past, a.count + b.count
+            alone = a.past.copy()
+            a.past.extend(b.past)
+            if alone[0][0] < b.newest_ns and a.misfit(m) <= 1.0:
+                a.count += b.count
+                a.waiting.extend(b.waiting)
                 self._tracks.remove(b)
-                self._held = deque((a if of is b else of, one) for of, one in self._held)
                 return a
+            a.past = alone
         return None
 
     def _go_on(self, at: Odometry) -> list[Odometry]:
         """Continue the track in use. Messages since then that do not continue it are not used."""
-        used = self._tracks[0]
-        out = [_labelled(m, used) for track, m in self._held if track is used]
-        for track, m in self._held:
-            if track is not used:
-                track.is_established = True
-                track.since.append(m)
-        self._held.clear()
-        for track in self._tracks[1:]:
-            self._drop(track.since, 1)  # the last may be what links the two
+        used, *others = self._tracks
+        for track in others:
             is_same = track.misfit(at) <= 1.0  # it was noise that made it look like another
-            if is_same or at.stamp_ns - track.newest_ns > _FORGOTTEN_NS:
-                self._drop(track.since, 0)
+            is_gone = is_same or at.stamp_ns - track.newest_ns > _FORGOTTEN_NS
+            self._drop(track, 0 if is_gone else 1)  # the last may be what links the two
+            track.is_established = True
+            if is_gone:
                 self._tracks.remove(track)
-        return out
-
-    def _jumped(self) -> list[Odometry]:
-        """Continue with the newest track; with all that is kept if there are too many tracks to decide."""
-        track, used = self._held[-1][0], self._tracks[0]
-        out = [m for of, m in self._held if of is track or len(self._held) > _MOST_HELD]
-        for _ in range(len(self._held) - len(out)):
-            self._refuse()
-        self._held.clear()
-        track.label = used.label
-        self._tracks = [track, *(one for one in self._tracks[1:] if one.is_established)]
-        return [_labelled(m, track) for m in out]
+        return _handed_on(used)
 
     def _switch_to(self, track: _Track) -> list[Odometry]:
-        """Use another track once the track in use has been silent for long enough."""
-        if track.count < _SURE or track.newest_ns - track.since[0].stamp_ns <= self._timeout_ns:
-            self._drop(track.since, _MOST_SINCE)
-            return []
-        if not track.label:
-            self._labels += 1
-            track.label = f"{track.since[-1].source}#{self._labels}"
-        out = [_labelled(m, track) for m in track.since]
-        track.since.clear()
+        """Use another publisher's track, beside the one that was in use; or a new one, to which that has jumped."""
+        used = self._tracks[0]
         self._tracks.remove(track)
-        self._tracks[0].is_established, track.is_established = True, False
+        if not track.is_established:
+            track.label = used.label
+            for one in self._tracks:
+                self._drop(one, _MOST_WAITING if one.is_established else 0)
+            self._tracks = [one for one in self._tracks if one.is_established]
+        elif not track.label:
+            self._labels += 1
+            track.label = f"{track.waiting[-1].source}#{self._labels}"
+        used.is_established, track.is_established = True, False
         self._tracks.insert(0, track)
-        return out
+        return _handed_on(track)
+
+    def _begin_anew(self) -> None:
+        for track in self._tracks:
+            self._drop(track, 0)
+        self._tracks.clear()
+
+    def _drop(self, track: _Track, kept: int) -> None:
+        """Use none of what waits, except perhaps the last few."""
+        while len(track.waiting) > kept:
+            track.waiting.popleft()
+            self._refuse()
 
 
-def _has_jumped(track: _Track, used: _Track) -> bool:
-    """Return whether a new track has gone on without the one in use for so long that the latter is given up."""
-    return track.count >= _SURE and track.newest_ns - track.first_ns >= max(_PERIODS * used.period_ns, _PATIENT_NS)
-
-
-def _labelled(m: Odometry, track: _Track) -> Odometry:
-    return m if track.label == m.source else replace(m, source=track.label)
+def _handed_on(track: _Track) -> list[Odometry]:
+    """What has waited, under the label of its track."""
+    out = [m if track.label == m.source else replace(m, source=track.label) for m in track.waiting]
+    track.waiting.clear()
+    return out

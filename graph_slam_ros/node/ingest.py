@@ -76,7 +76,7 @@ class Ingest:
         self._counters = counters
         topics = {one.name: _full_topic(node, one.topic) for one in config.sources if one.name in uses(config)}
         self.check = InputCheck(config, topics, counters)
-        self.converter = MessageConverter(config, counters, self.check.decoders(_installed(config)))
+        self.converter = MessageConverter(config, counters, _installed(config))
         self.converter.on_fault = node.get_logger().error
         self.gate = IngestGate(counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)

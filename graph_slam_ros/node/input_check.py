@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from graph_slam_ros.check.checks import worst_while_driving
 from graph_slam_ros.check.columns import Collector, Columns
@@ -14,7 +15,7 @@ from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.findings.table import DOUBTS
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Measured, Odometry
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Decoder, OwnDecoder
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.slam import Config
 
@@ -44,7 +45,8 @@ class InputCheck:
         self._counters = counters
         used = uses(config)
         checked = [one for one in config.sources if used.get(one.name) in ("landmarks", "odometry")]
-        self._types = {one.type for one in checked} | {TRANSFORMS}
+        types = {one.type for one in checked}
+        self._read = {TF, TF_STATIC} | {one.name for one in config.sources if one.type in types}
         self._odometry = {topics[one.name] for one in checked if used[one.name] == "odometry"}
         self._last_ns: dict[str, int] = {}
         self._last_s: dict[str, float] = {}
@@ -53,23 +55,21 @@ class InputCheck:
         self._due_s, self._goes_on = 0.0, False
         self.findings: tuple[Finding, ...] = ()
 
-    def decoders(self, installed: Mapping[str, Decoder]) -> dict[str, Decoder]:
-        """Return these decoders, and those of landmarks and odometry, whose messages are collected, too."""
-        seen = {name: self._collector.decoder(installed.get(name) or OwnDecoder(name)) for name in self._types}
-        return dict(installed) | seen
-
-    def add(self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured]) -> None:
-        """Collect what a message of these inputs has measured; of odometry, a part is enough."""
+    def add(
+        self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured], message: Any = None
+    ) -> None:
+        """Collect a decoded message of these inputs, and what it has measured; of odometry, a part is enough."""
         is_held = len(measured) > 1  # until now: its messages are collected already
         some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m) or is_held]
         if topic in self._odometry:
             if (some or not measured) and self._is_due(topic):  # what was used is collected as it was used, too
                 self._kept += 1
             else:
-                self._collector.leave_out()
+                message = None
                 self._left_out += 1
         self._messages += 1
-        self._collector.add(topic, [name for name in names if name != TF], now_ns, some)
+        message = None if self._read.isdisjoint(names) else message
+        self._collector.add(topic, [name for name in names if name != TF], now_ns, some, message)
 
     def forget(self) -> None:
         """Begin anew, with other stamps."""

@@ -209,7 +209,7 @@ class Subscriptions:
                 self._note_late(name, given)
                 measured += given
             ingest.receive(measured, cdr)
-            ingest.check.add(topic.name, names, self._node.now_ns, measured)
+            ingest.check.add(topic.name, names, self._node.now_ns, measured, ingest.converter.decoded)
 
         guarded = self._node.guarded
         self._subscriptions.append(self._created(topic, _with_info(guarded(on_message), on_message), guarded(on_lost)))

@@ -10,9 +10,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from graph_slam_ros.messages.from_msg import TRANSFORMS, Decoder, OwnDecoder
+from graph_slam_ros.messages.from_msg import TRANSFORMS, Decoder, own_decoder
 from graph_slam_ros.messages.inputs import known_types
-from graph_slam_ros.messages.inputs.landmark_types import fields_used
+from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.plugins import input_type
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.part import BagError, Topic
@@ -29,9 +29,8 @@ _NEEDED = {
     "vision_msgs/msg/ObjectHypothesis": "",
     "vision_msgs/msg/BoundingBox3D": "center size",
     "visualization_msgs/msg/Marker": "header ns id action pose",
-    **fields_used(),
 }
-"""What the converters read of each type; of others all that ours have, and of packages that we have not, by name."""
+"""What the converters read of each type; of others all that ours have."""
 _OLDER = {
     "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
     "vision_msgs/msg/Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
@@ -58,7 +57,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
     if not topic.definition and topic.type in _OLDER:
         return _of_any_version(topic.type)
     if not topic.definition and topic.type in typestore().types:
-        return OwnDecoder(topic.type)
+        return own_decoder(topic.type)
     if not topic.definition:
         plugin = input_type(topic.type)
         if plugin is None or not plugin.definition:
@@ -69,7 +68,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
 
 def _of_any_version(type_name: str) -> Decoder:
     """A decoder without a recorded definition: by ours, else by the older one."""
-    ours, recorded = OwnDecoder(type_name), dict[str, Any]()
+    ours, recorded = own_decoder(type_name), dict[str, Any]()
     for name, text in _OLDER.items():
         recorded |= get_types_from_msg(text, name)
     older = _store_with(recorded)
@@ -92,11 +91,14 @@ def _by_definition(topic: Topic, whose: str) -> Decoder:
         raise BagError(f"topic {topic.name}: {whose} definition of {topic.type} is not valid") from error
     ours = typestore().fielddefs
     if all(ours.get(name) == definition for name, definition in recorded.items()):
-        return OwnDecoder(topic.type)
+        return own_decoder(topic.type)
+    theirs = {field for name, (_, fields) in recorded.items() if name not in ours for field, _ in fields}
+    for field in LANDMARK_TYPES[topic.type].fields.split() if topic.type in LANDMARK_TYPES else ():
+        if field not in theirs:
+            raise BagError(f"topic {topic.name}: {topic.type} of this recording has no field {field!r}")
     for name, (_, fields) in recorded.items():
-        there = dict(fields)
-        known = dict(ours[name][1]) if name in ours else there
-        for field in _NEEDED[name].split() if name in _NEEDED else known if name in ours else ():
+        there, known = dict(fields), dict(ours[name][1]) if name in ours else {}
+        for field in _NEEDED[name].split() if name in _NEEDED else known:
             if field not in there:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
             if there[field] != known[field]:

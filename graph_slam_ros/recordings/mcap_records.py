@@ -4,23 +4,23 @@ The library parses the records. The walk from one record to the next is ours, be
 first damage, trust every length, and decompress without limit.
 """
 
+import errno
 import io
 import os
 import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE
-from mcap.summary import Summary
 from mcap.writer import Writer
 
 from graph_slam_ros.errors import FormatError
@@ -33,11 +33,12 @@ MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "graph_slam_ros"
 """What the head of our own files names as the program that wrote them."""
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
-_READ: dict[Opcode, Any] = {
+_READ: dict[int, Any] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.MESSAGE: Message,
     Opcode.CHUNK: Chunk,
+    Opcode.STATISTICS: Statistics,
     Opcode.DATA_END: DataEnd,
 }
 _MOST_PADDING = 64  # a later version may add fields; after a damaged length there is more
@@ -48,26 +49,44 @@ _CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}
 _CHUNK_HEAD = 57
 
 
-Contents: TypeAlias = tuple[dict[int, Schema], dict[int, Channel], dict[int, int], int]
-"""Schemas and channels by id, messages by channel id, and the time of the first message."""
-
-
-class _Stream(io.BufferedReader):
-    """A file that is never read beyond ``end``, because a length in a damaged file may be 2^60."""
+class _File:
+    """A file whose parts are read whole, or not at all, because a length in a damaged file may be 2^60."""
 
     def __init__(self, path: Path, follow: bool = True) -> None:
-        super().__init__(opened(path, follow=follow))
-        self.size = self.end = os.fstat(self.fileno()).st_size
+        self.raw = opened(path, follow=follow)
+        self.size = os.fstat(self.raw.fileno()).st_size
 
-    def go(self, at: int, end: int | None = None) -> None:
-        self.end = self.size if end is None else end
-        self.seek(at)
+    def part(self, at: int, size: int) -> bytes:
+        if not 0 <= at <= self.size - size:
+            raise EndOfFile()
+        return os.pread(self.raw.fileno(), size, at)
+
+    def __enter__(self) -> "_File":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.raw.close()
+
+
+class _Whole(io.BytesIO):
+    """The data of one record, of which too few bytes are an error."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        left = self.end - self.tell()
-        if size is not None and size > left:
+        out = super().read(size)
+        if size is not None and len(out) < size:
             raise EndOfFile()
-        return super().read(left if size is None or size < 0 else size)
+        return out
+
+
+@dataclass(slots=True)
+class _Contents:
+    """Schemas and channels by id, messages by channel id and, by the summary, of all; the time of the first."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    announced: int | None = None
+    first_ns: int = 2**64
 
 
 def begin(profile: str = "", library: str = LIBRARY) -> bytes:
@@ -83,9 +102,13 @@ class McapPart(Part):
     def __init__(self, file: Path) -> None:
         super().__init__(file)
         losses: list[str] = []
-        schemas, self._channels, counts, self.first_ns = _summed_up(file) or _read_through(file, losses)
-        for number, channel in self._channels.items():
-            self.topics.append(self._topic(channel, schemas.get(channel.schema_id), counts.get(number, 0)))
+        with _File(file) as stream:
+            known = _summary(stream)
+        if known.announced is None or not known.channels:
+            known = _contents(records(file, losses))
+        self._channels, self.first_ns = known.channels, known.first_ns
+        for number, channel in known.channels.items():
+            self.topics.append(self._topic(channel, known.schemas.get(channel.schema_id), known.counts[number]))
         if not self.topics:
             raise BagError(f"{file}: no topic in it{' that is whole; ' + losses[0] if losses else ''}")
 
@@ -111,29 +134,31 @@ class McapPart(Part):
         return in_cdr(topic, channel.metadata.get("md5sum", ""), self.ros1) if topic.encoding == "ros1" else topic
 
 
-def _summed_up(file: Path) -> Contents | None:
-    try:
-        with _Stream(file) as stream:
-            summary = _summary(stream)
-    except Exception:  # of a damaged file the library raises almost anything
-        return None
-    if summary is None or summary.statistics is None or not summary.channels:
-        return None
-    counts, first_ns = summary.statistics.channel_message_counts, summary.statistics.message_start_time
-    return summary.schemas, summary.channels, counts, first_ns
-
-
-def _read_through(file: Path, losses: list[str]) -> Contents:
-    schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), Counter[int](), 2**64
-    for record in records(file, losses):
+def _contents(records: Iterable[McapRecord]) -> _Contents:
+    out = _Contents()
+    for record in records:
         if isinstance(record, Message):
-            counts[record.channel_id] += 1
-            first_ns = min(first_ns, record.log_time)
+            out.counts[record.channel_id] += 1
+            out.first_ns = min(out.first_ns, record.log_time)
         elif isinstance(record, Schema):
-            schemas[record.id] = record
+            out.schemas[record.id] = record
         elif isinstance(record, Channel):
-            channels[record.id] = record
-    return schemas, channels, counts, first_ns
+            out.channels[record.id] = record
+        elif isinstance(record, Statistics):
+            out.counts.update(record.channel_message_counts)
+            out.announced, out.first_ns = record.message_count, record.message_start_time
+    return out
+
+
+def _summary(file: _File) -> _Contents:
+    """The contents by the summary at the end; empty where that is damaged or missing."""
+    try:
+        end = file.size - MAGIC_SIZE - 4  # of the footer, but for the checksum of all from the summary on; 0: none
+        start, _, crc = struct.unpack("<QQI", file.part(end - 16, 20))
+        data = file.part(start, min(end - start, MOST_BYTES)) if start else b""
+        return _contents(_inside(data[: -16 - _HEAD.size])) if crc in (0, zlib.crc32(data)) else _Contents()
+    except Exception:  # of a damaged file the library raises almost anything
+        return _Contents()
 
 
 def records(
@@ -147,115 +172,106 @@ def records(
     """
     known = len(losses)
     read, unchecked, is_unindexed = 0, False, False
-    with _Stream(path, follow) as stream:
-        at = (_next_chunk(stream, max(0, stream.size - last_bytes)) or stream.size) if last_bytes else MAGIC_SIZE
+    with _File(path, follow) as file:
+        at = (_next_chunk(file, max(0, file.size - last_bytes)) or file.size) if last_bytes else MAGIC_SIZE
         while True:
             try:
-                record, after = _record(stream, at)
-            except Exception as error:  # see _summed_up
-                next_chunk = _next_chunk(stream, at + 1)
-                losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, stream.size)}")
+                record, after = _record(file, at)
+            except Exception as error:  # see _summary
+                next_chunk = _next_chunk(file, at + 1)
+                losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, file.size)}")
                 if next_chunk is None:
                     break
                 at = next_chunk
                 continue
-            if isinstance(record, Chunk):
-                unchecked |= not record.uncompressed_crc
-                try:
-                    for inner in _inside(record):
-                        read += isinstance(inner, Message)
-                        yield inner
-                except Exception as error:  # see _summed_up
-                    losses.append(
-                        f"{path.name}: a damaged chunk of {after - at} bytes was passed over ({_what(error)})"
-                    )
-            elif isinstance(record, DataEnd):
-                if is_unindexed and record.data_section_crc not in (0, _checksum(stream, at)):
-                    losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
+            is_unindexed |= isinstance(record, Message)
+            unchecked |= isinstance(record, Chunk) and not record.uncompressed_crc
+            if isinstance(record, DataEnd):
                 unchecked |= is_unindexed and not record.data_section_crc
-                if len(losses) == known and not _ends_whole(stream):  # of a journal it may be more than the summary
+                if is_unindexed and record.data_section_crc not in (0, _checksum(file, at)):
+                    losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
+                ends_whole = file.part(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+                if len(losses) == known and not ends_whole:  # of a journal it may be more than the summary
                     where = losses if warnings is None else warnings
                     where.append(f"{path.name}: cut off in the summary at its end; all {read} messages were read")
                 break
-            elif record is not None:
-                is_unindexed |= isinstance(record, Message)
-                read += isinstance(record, Message)
-                yield record
+            try:
+                for one in _inside(_plain(record)) if isinstance(record, Chunk) else filter(None, [record]):
+                    read += isinstance(one, Message)
+                    yield one
+            except Exception as error:  # see _summary
+                losses.append(f"{path.name}: a damaged chunk of {after - at} bytes was passed over ({_what(error)})")
             at = after
-        announced = _announced(stream)
+        announced = _summary(file).announced
         if announced is not None and announced != read:  # a record whose kind is damaged is passed over in silence
-            what = f"{announced - read} of its messages could not be read"
-            if read > announced:
-                what = f"{read - announced} messages too many"
-            losses.append(f"{path.name}: {what}")
+            missing = f"{announced - read} of its messages could not be read"
+            losses.append(f"{path.name}: {missing if read < announced else f'{read - announced} messages too many'}")
     if unchecked and len(losses) > known and warnings is not None:
         warnings.append(f"{path.name}: carries no checksums: more of it may be damaged than was found")
 
 
-def _record(stream: _Stream, at: int) -> tuple[McapRecord | None, int]:
+def _record(file: _File, at: int) -> tuple[McapRecord | None, int]:
     """The record at a position, or nothing if it is of no interest, and the position of the next one.
 
     Raises almost any exception if the record is damaged.
     """
-    stream.go(at)
-    opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
-    after = at + _HEAD.size + length
-    if after > stream.size:
+    opcode, length = _HEAD.unpack(file.part(at, _HEAD.size))
+    begins = at + _HEAD.size
+    if begins + length > file.size:
         raise EndOfFile()
     if opcode not in _READ:
-        return None, after
+        return None, begins + length
     if length > MOST_BYTES:
         raise FormatError(f"a record of {length} bytes; {MOST_BYTES} is the limit")
-    stream.end = after
-    return _parsed(opcode, ReadDataStream(stream), length), after
+    return _parsed(opcode, file.part(begins, length), 0, length), begins + length
 
 
-def _parsed(opcode: int, stream: ReadDataStream, length: int) -> McapRecord:
-    start = stream.count
-    kind = _READ[Opcode(opcode)]
-    record: McapRecord = Message.read(stream, length) if kind is Message else kind.read(stream)
-    padding = length - (stream.count - start)
-    if not 0 <= padding <= _MOST_PADDING:
-        raise FormatError(f"a record of {length} bytes with {length - padding} in it")
-    stream.read(padding)
+def _inside(data: bytes) -> Iterator[McapRecord]:
+    """The records of a chunk or of the summary one by one, because a list of them would double the memory."""
+    at = 0
+    while at < len(data):
+        opcode, length = _HEAD.unpack_from(data, at)
+        begins = at + _HEAD.size
+        at = begins + length
+        if at > len(data):
+            raise EndOfFile()
+        if opcode in _READ:
+            yield _parsed(opcode, data, begins, at)
+
+
+def _parsed(opcode: int, data: bytes, begin: int, end: int) -> McapRecord:
+    """A record of the data from begin to end."""
+    if opcode == Opcode.MESSAGE and end - begin >= _MESSAGE.size:  # the library reads number by number
+        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, begin)
+        return Message(channel, log_ns, data[begin + _MESSAGE.size : end], publish_ns, sequence)
+    stream = ReadDataStream(_Whole(data[begin:end]))
+    record: McapRecord = _READ[opcode].read(stream)
+    if end - begin - stream.count > _MOST_PADDING:
+        raise FormatError(f"a record of {end - begin} bytes with {stream.count} in it")
     return record
 
 
-def _inside(chunk: Chunk) -> Iterator[McapRecord]:
-    """The records of a chunk one by one, because a list of them would double the memory."""
+def _plain(chunk: Chunk) -> bytes:
     plain = decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
     if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
         raise FormatError("its checksum is another")
-    at, size = 0, len(plain)
-    while at < size:
-        opcode, length = _HEAD.unpack_from(plain, at)
-        at += _HEAD.size
-        after = at + length
-        if after > size:
-            raise EndOfFile()
-        if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:  # the library reads number by number
-            channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(plain, at)
-            yield Message(channel, log_ns, plain[at + _MESSAGE.size : after], publish_ns, sequence)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            yield _parsed(opcode, ReadDataStream(io.BytesIO(plain[at:])), length)
-        at = after
+    return plain
 
 
-def _next_chunk(stream: _Stream, at: int) -> int | None:
+def _next_chunk(file: _File, at: int) -> int | None:
     """Return the position of the next intact chunk: its header is consistent, and its end is in the file.
 
     The search reads small blocks first and doubles their size, so that many forged headers cost little.
     """
     size = _FIRST_BLOCK
-    while (at := _data_from(stream, at)) < stream.size:
-        stream.go(at)
-        block = stream.read(min(size + _CHUNK_HEAD, stream.size - at))
+    while (at := _data_from(file, at)) < file.size:
+        block = file.part(at, min(size + _CHUNK_HEAD, file.size - at))
         for found in _CHUNK.finditer(block):
             if found.start() >= size:
                 break
             length, within = int.from_bytes(found[1], "little"), int.from_bytes(found[3], "little")
             begins = at + found.start()
-            is_whole = length == within + 36 + len(found[2]) and begins + _HEAD.size + length <= stream.size
+            is_whole = length == within + 36 + len(found[2]) and begins + _HEAD.size + length <= file.size
             if is_whole and length <= MOST_BYTES:
                 return begins
         at += size
@@ -263,20 +279,12 @@ def _next_chunk(stream: _Stream, at: int) -> int | None:
     return None
 
 
-def _data_from(stream: _Stream, at: int) -> int:
+def _data_from(file: _File, at: int) -> int:
     """The next byte that is stored on the disk: a sparse file may claim a terabyte."""
     try:
-        return os.lseek(stream.fileno(), at, os.SEEK_DATA)
-    except OSError:  # nothing follows; or the file system does not know
-        return at if at < stream.size and not _knows_holes(stream) else stream.size
-
-
-def _knows_holes(stream: _Stream) -> bool:
-    try:
-        os.lseek(stream.fileno(), 0, os.SEEK_HOLE)
-    except OSError:
-        return False
-    return True
+        return os.lseek(file.raw.fileno(), at, os.SEEK_DATA)
+    except OSError as error:  # nothing follows; or the file system does not know
+        return file.size if error.errno == errno.ENXIO else at
 
 
 def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: int) -> str:
@@ -289,38 +297,8 @@ def _what(error: Exception) -> str:
     return str(error) if isinstance(error, FormatError) else type(error).__name__
 
 
-def _summary(stream: _Stream) -> Summary | None:
-    return make_reader(stream).get_summary() if _has_whole_summary(stream) else None
-
-
-def _announced(stream: _Stream) -> int | None:
-    """Return the number of messages by the summary; None if it is damaged or does not have the number."""
-    try:
-        summary = _summary(stream)
-    except Exception:  # see _summed_up
-        return None
-    return summary.statistics.message_count if summary is not None and summary.statistics is not None else None
-
-
-def _has_whole_summary(stream: _Stream) -> bool:
-    """The footer: the position of the summary, and its checksum, 0 if there is none."""
-    end = stream.size - MAGIC_SIZE - 4
-    stream.go(end - 16)
-    summary, _, crc = struct.unpack("<QQI", stream.read(20))
-    is_whole = 0 < summary < end and crc in (0, _checksum(stream, end, summary))
-    stream.go(0)
-    return is_whole
-
-
-def _ends_whole(stream: _Stream) -> bool:
-    stream.go(stream.size - MAGIC_SIZE)
-    return stream.read(MAGIC_SIZE) == MAGIC
-
-
-def _checksum(stream: _Stream, end: int, start: int = 0) -> int:
-    stream.go(start, end)
+def _checksum(file: _File, end: int) -> int:
     crc = 0
-    while block := stream.read(min(_BLOCK, end - stream.tell())):
-        crc = zlib.crc32(block, crc)
-    stream.end = stream.size
+    for at in range(0, end, _BLOCK):
+        crc = zlib.crc32(file.part(at, min(_BLOCK, end - at)), crc)
     return crc

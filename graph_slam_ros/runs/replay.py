@@ -83,8 +83,6 @@ class RecordedRuns:
         self.counted: list[Counters] = []
         used = [bag.topics[topic] for topic in inputs.topics.values()]
         decoders = {topic.type: recorded_decoder(topic) for topic in used}
-        if columns is not None:
-            decoders = {type_name: columns.decoder(decode) for type_name, decode in decoders.items()}
         self._converter = MessageConverter(config, counters, decoders)
         self._converter.on_fault = bag.warnings.append
         for name in counters.received.keys() - inputs.topics.keys():
@@ -115,12 +113,13 @@ class RecordedRuns:
             return []
         run = self._converter.convert_run(names[0], [m.cdr for m in messages], self._gate.newest_ns(names[0]))
         if self._columns is not None and run:
-            self._columns.add_run(messages[0].topic, [m.log_ns for m in messages[: len(run)]], run)
+            log_ns = [m.log_ns for m in messages[: len(run)]]
+            self._columns.add_run(messages[0].topic, log_ns, run, self._converter.decoded)
         return run
 
     def _collect(self, message: BagMessage, names: Sequence[str], measured: list[Measured]) -> None:
         if self._columns is not None:
-            self._columns.add(message.topic, names, message.log_ns, measured)
+            self._columns.add(message.topic, names, message.log_ns, measured, self._converter.decoded)
 
     def _passed(self, measured: list[Measured], names: Sequence[str]) -> Iterator[tuple[int, list[Measured | Control]]]:
         passage = self._gate.admit(measured, self._on_jump)

@@ -1,7 +1,7 @@
 """Reading of landmark messages with positions or poses; ``landmarks`` judges what they contain."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,9 +48,7 @@ def _size(box: Any) -> float:
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: one landmark, with the configured id."""
-    has_covariance = hasattr(m.pose, "covariance")
-    at, covariance = (m.pose.pose, m.pose.covariance) if has_covariance else (m.pose, None)
-    yield ObservedLandmark(m.header.stamp, m.header.frame_id, "", at.position, at.orientation, covariance)
+    yield _posed("", m)
 
 
 def transforms(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
@@ -103,17 +101,30 @@ def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
         yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, position, orientation)
 
 
-def tags_with_poses(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """Markers and AprilTags with poses: the header of the pose, else of the tag, else of the array (sent later)."""
-    for one in m.markers if hasattr(m, "markers") else m.detections:
-        headers = [of.header for of in (one.pose, one, m) if hasattr(of, "header")]
-        stamp = next((h.stamp for h in headers if h.stamp.sec or h.stamp.nanosec), headers[0].stamp)
-        frame = next((h.frame_id for h in headers if h.frame_id), "")
-        of = one.pose.pose if hasattr(one.pose.pose, "pose") else one.pose
-        number = "_".join(str(part) for part in np.ravel(one.id))
-        name = f"{one.family}:{number}" if getattr(one, "family", "") else number
-        covariance = getattr(of, "covariance", None)
-        yield ObservedLandmark(stamp, frame, name, of.pose.position, of.pose.orientation, covariance)
+def marks(things: Sequence[Sequence[str]], source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
+    """Things with a pose of any kind, by the fields of their array, and in it of identity and pose."""
+    for array, name, place in things:
+        for one in getattr(m, array):
+            identity = "_".join(str(part) for part in np.ravel(getattr(one, name)))
+            if getattr(one, "family", ""):
+                identity = f"{one.family}:{identity}"
+            yield _posed(identity, getattr(one, place), one, m)
+
+
+def _posed(name: str, *parts: Any) -> ObservedLandmark:
+    """A landmark of a pose or transform, and of the messages that it is a part of, from the inside out.
+
+    The first header with a stamp, or a frame, has it: that of an array is often the time of sending.
+    """
+    at, parts = parts[0], parts[1:]
+    while hasattr(at, "pose"):
+        at, parts = at.pose, (at, *parts)
+    headers = [of.header for of in parts if hasattr(of, "header")]
+    stamp = next((h.stamp for h in headers if h.stamp.sec or h.stamp.nanosec), headers[0].stamp)
+    frame = next((h.frame_id for h in headers if h.frame_id), "")
+    covariance = next((of.covariance for of in parts if hasattr(of, "covariance")), None)
+    position, rotation = (at.translation, at.rotation) if hasattr(at, "rotation") else (at.position, at.orientation)
+    return ObservedLandmark(stamp, frame, name, position, rotation, covariance)
 
 
 def ros2_aruco(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
@@ -121,29 +132,13 @@ def ros2_aruco(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     if len(m.marker_ids) != len(m.poses):
         raise MessageError("lengths_differ")
     for name, at in zip(m.marker_ids, m.poses, strict=True):
-        yield ObservedLandmark(m.header.stamp, m.header.frame_id, str(int(name)), at.position, at.orientation)
-
-
-def aruco_opencv(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """aruco_opencv_msgs/ArucoDetection: single markers by number and boards by name."""
-    named = [(str(one.marker_id), one.pose) for one in m.markers] + [(one.board_name, one.pose) for one in m.boards]
-    for name, at in named:
-        yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at.position, at.orientation)
-
-
-def fiducials(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """fiducial_msgs/FiducialTransformArray: its errors are those in the image, not a covariance."""
-    for one in m.transforms:
-        at = one.transform
-        yield ObservedLandmark(m.header.stamp, m.header.frame_id, str(one.fiducial_id), at.translation, at.rotation)
+        yield _posed(str(int(name)), at, m)
 
 
 def rtabmap(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """rtabmap_msgs/LandmarkDetections: an id of zero or less means none."""
     for one in m.landmarks:
-        name = str(one.id) if one.id > 0 else ""
-        frame, at = one.header.frame_id or m.header.frame_id, one.pose.pose
-        yield ObservedLandmark(m.header.stamp, frame, name, at.position, at.orientation, one.pose.covariance)
+        yield _posed(str(one.id) if one.id > 0 else "", one, m)
 
 
 def cartographer(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

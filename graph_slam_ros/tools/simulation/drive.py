@@ -14,7 +14,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.formats.durable import replaced
 from graph_slam_ros.lie import se3
-from graph_slam_ros.messages.from_msg import OwnDecoder
+from graph_slam_ros.messages.from_msg import own_decoder
 from graph_slam_ros.messages.to_msg import encode, time, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.tools.simulation.bag import ODOMETRY_TOPIC, TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
@@ -78,7 +78,7 @@ class Drive:
         self.odometry_topic = _only(types, ODOMETRY_TOPIC, (_ODOMETRY,))
         self.landmarks_topic = _only(types, LANDMARKS_TOPIC, (DETECTIONS, POINTS))
         changed = {self.odometry_topic, self.landmarks_topic}
-        decode = {name: OwnDecoder(types[name]) for name in changed}
+        decode = {name: own_decoder(types[name]) for name in changed}
         self.part_of_file = 1.0
         self.messages = [
             Message(m.topic, types[m.topic], m.log_ns, decode[m.topic](m.cdr) if m.topic in changed else m.cdr)
@@ -100,7 +100,7 @@ class Drive:
         others = {TRUTH_TOPIC, TRUE_LANDMARKS_TOPIC, self.landmarks_topic}
         found = [*self.landmarks] if {DETECTIONS, POINTS} & {*types} else []
         found += [m for m in self.messages if m.type in types and m.topic not in others]
-        decode = {name: OwnDecoder(name) for name in {m.type for m in found if isinstance(m.content, bytes)}}
+        decode = {name: own_decoder(name) for name in {m.type for m in found if isinstance(m.content, bytes)}}
         for m in found:
             if isinstance(m.content, bytes):
                 m.content = decode[m.type](m.content)

@@ -10,7 +10,7 @@ from reliability import times
 from rows import each
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.messages.from_msg import OwnDecoder
+from graph_slam_ros.messages.from_msg import own_decoder
 from graph_slam_ros.messages.to_msg import encode, header, make, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.tools.simulation import Fault, simulate, write_faulty_bag
@@ -41,7 +41,7 @@ def copy(source, target, odom=None, seen=None):
     bag, count = open_bag(source), Counter()
     with BagWriter(target) as out:
         for m in bag.messages(set(bag.topics)):
-            message = OwnDecoder(bag.topics[m.topic].type)(m.cdr)
+            message = own_decoder(bag.topics[m.topic].type)(m.cdr)
             change = {"/odom": odom, "/landmarks": seen}.get(m.topic)
             if change is None or change(message, count[m.topic]) is not False:
                 out.write(m.topic, bag.topics[m.topic].type, m.log_ns, encode(message))
@@ -103,7 +103,7 @@ def on_a_joint(source, target, every_s):
     bag, due_ns = open_bag(source), 0
     with BagWriter(target) as out:
         for m in bag.messages(set(bag.topics)):
-            message = OwnDecoder(bag.topics[m.topic].type)(m.cdr)
+            message = own_decoder(bag.topics[m.topic].type)(m.cdr)
             if m.topic == "/odom" and m.log_ns >= due_ns:
                 due_ns = m.log_ns + round(every_s * 1e9)
                 joint = transform(m.log_ns, "base_link", "joint", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
@@ -144,7 +144,7 @@ def test_a_twist_is_compared_where_the_robot_moves_though_it_stands_most_of_the_
         for m in bag.messages(set(bag.topics)):
             out.write(m.topic, bag.topics[m.topic].type, m.log_ns, m.cdr)
             last = m if m.topic == "/odom" else last
-        message = OwnDecoder(bag.topics["/odom"].type)(last.cdr)
+        message = own_decoder(bag.topics["/odom"].type)(last.cdr)
         message.twist.twist.linear.x = message.twist.twist.linear.y = 0.005
         for k in range(1, 1500):
             stamp_ns = last.log_ns + k * 100_000_000

@@ -30,7 +30,7 @@ def new_check(**settings):
     """A check of /odom and /tags, and what converts messages for it."""
     config, counters = Config.from_mapping({"inputs.tf": False, **settings}), Counters()
     check = InputCheck(Config(), {"odom": "/odom", "detections": "/tags"}, counters)
-    return check, MessageConverter(config, counters, check.decoders({})), counters
+    return check, MessageConverter(config, counters), counters
 
 
 def checked(clock, steps, unit=1.0, y=1.0, check=None, rate_hz=20):
@@ -113,7 +113,8 @@ def test_odometry_is_checked_by_itself_with_its_twist(wrong, text, clock):
     check, converter, _ = new_check()
     for k in range(400):
         clock[0] += 1.0
-        check.add("/odom", ["odom"], 10**15 + k * NS // 20, converter.convert("odom", odometry(k, **wrong)))
+        measured = converter.convert("odom", odometry(k, **wrong))
+        check.add("/odom", ["odom"], 10**15 + k * NS // 20, measured, converter.decoded)
     run_job(check, clock)
     assert len(check.findings) == (text is not None), check.findings
     for one in map(str, check.findings):
@@ -133,7 +134,7 @@ def test_two_publishers_on_a_busy_machine_have_no_wrong_units(clock):
     for clock[0], which, k in sorted(arrivals):
         stamp_ns = 10**15 + k * 30_000_000 + which * 10_000_000
         cdr = odometry(0.6 * k, stamp_ns=stamp_ns, x=80.0 * which)
-        check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr))
+        check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr), converter.decoded)
         if (job := check.job()) is not None:
             job()
         assert check.findings == ()
