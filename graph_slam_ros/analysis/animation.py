@@ -80,7 +80,7 @@ def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
     """The estimate after equal times, and at the end. Time goes on from keyframe to keyframe, also of a set clock."""
     config = run_config(run).changed({"map.condense": False})  # all of the path is drawn
     start = read_start(run)
-    stamps_s = read_rows(run / "path.tum").stamps_s[max(start.keyframe_count - 1, 0) if start else 0 :]
+    stamps_s = read_rows(run / "path.tum").stamps_s[max(len(start.keyframes) - 1, 0) if start else 0 :]
     step_s = float(np.maximum(np.diff(stamps_s), 0.0).sum()) / max(frames - 1, 1)
     slam = GraphSlam(config, start=start)
     view = slam.view

@@ -366,7 +366,7 @@ def condensed_lines(run: SavedGraph) -> Iterator[str]:
     if run.view.bounded is None:
         return
     places = [one.place for several in run.view.bounded.places.values() for one in several]
-    visits, keyframes = sum(one.visits for one in places), run.view.first_keyframe
+    visits, keyframes = sum(one.visits for one in places), run.view.keyframes.first
     yield f"condensed: keyframes 0 to {keyframes - 1}, into {len(places)} places of {visits} visits"
     factor = run.view.bounded.scale.factor
     if factor > 1.0:

@@ -266,7 +266,7 @@ class SavedGraph:
         self.segments = list(view.segments)
         joined = {vertex for entry in self.entries if entry.is_in for vertex in entry.vertices}
         self.landmarks = {name: mark.vertex for name, mark in view.landmarks.items() if mark.vertex in joined}
-        self.numbers: list[int] = [*(one.number for one in old), *range(view.first_keyframe, len(view.keyframes))]
+        self.numbers: list[int] = [*(one.number for one in old), *range(view.keyframes.first, len(view.keyframes))]
         self._numbers = dict(zip(self.keyframes, self.numbers, strict=True))
         self.vertices = dict(zip(self.numbers, self.keyframes, strict=True))
 

@@ -164,10 +164,10 @@ def _fitted(
     if one.parameter in off:
         of_pose = twist_factor(c.odometry) * c.config.odometry.distance_factor
         is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
-        told = answers.off_by(fit, one.parameter, off, view.calibrated, may_be_ranges=not is_pose)
+        told = answers.off_by(fit, one.parameter, off, view.corrections.total, may_be_ranges=not is_pose)
         setting, lag_s, own = told.setting, float(np.median(topic.lag_s)), c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
-            setting = f"{own}.offset_s", round(view.calibrated(own, "clock") - one.value, 3)
+            setting = f"{own}.offset_s", round(view.corrections.total(own, "clock") - one.value, 3)
         is_open = code == "odometry_scale" and not is_pose
         settings = () if is_open or not setting else (assignment(*setting),)
         yield topic.finding(code, "warning", one.value, limit, unit, told.text, settings=settings)

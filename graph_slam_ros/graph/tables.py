@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import records
@@ -26,7 +26,7 @@ class Column:
 
     __slots__ = ("_buffer", "_values", "count", "room")
 
-    def __init__(self, dtype: type, *shape: int) -> None:
+    def __init__(self, dtype: DTypeLike, *shape: int) -> None:
         self.__setstate__(np.empty((0, *shape), dtype=dtype))
 
     def __getstate__(self) -> NDArray[Any]:

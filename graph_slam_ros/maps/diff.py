@@ -166,7 +166,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
         verdicts,
         [edit.text for edit in one.edits if edit.edit not in [other.edit for other in two.edits]],
         [edit.text for edit in two.edits if edit.edit not in [other.edit for other in one.edits]],
-        (one.first_keyframe, two.first_keyframe),
+        (one.keyframes.first, two.keyframes.first),
         merge_trouble(one, two, a, b),
     )
 

@@ -320,7 +320,7 @@ class Rehearsal:
         return after, Edited(
             done,
             (before.solver.evaluate().chi2_final, after.solver.evaluate().chi2_final),
-            (after.first_keyframe + farthest, float(distances[farthest])),
+            (after.keyframes.first + farthest, float(distances[farthest])),
             float(distances[-1]),
             tuple(_fit(after, edge, cost) for edge, cost in zip(added, costs, strict=True)),
             tuple(edge for edge in inside if edge not in by_hand and not after.ledger.is_inside(edge)),

@@ -73,7 +73,7 @@ def _mcap(view: MapView, whole: WholePath, out: Path) -> list[Path]:
     """
     frame, unused = view.config.frames.map, to_msg.UNUSED
     path, stamps_ns, dof = whole.poses(), whole.stamps_ns.tolist(), view.space.dof
-    unknown = np.broadcast_to(unused * np.eye(dof), (view.first_keyframe, dof, dof))
+    unknown = np.broadcast_to(unused * np.eye(dof), (view.keyframes.first, dof, dof))
     poses = zip(stamps_ns, path, np.concatenate((unknown, view.keyframe_covariances())), strict=True)
     last_ns, landmarks = view.keyframes[-1].stamp_ns, results.landmark_estimates(view)
     with replaced(out) as new, BagWriter(new) as bag:

@@ -160,7 +160,7 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
 
 def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:
     """Remove the second session's sightings of landmarks that are elsewhere in it. Those that fit come back later."""
-    last, inside = state.keyframe_count - 1, state.ledger.inside
+    last, inside = len(state.keyframes) - 1, state.ledger.inside
     for edge in inside[inside >= first_edge].tolist():
         statistic = chi2.get(landmark_of(state.graph, edge) or 0)
         if statistic is not None:

@@ -40,7 +40,7 @@ class PathUpdates:
         It is due for a new subscriber, and after another ``GraphSlam`` has begun.
         """
         self.version = 1
-        self._sent, self._first = np.empty((0, 0)), view.first_keyframe
+        self._sent, self._first = np.empty((0, 0)), view.keyframes.first
         return to_msg.path(view.config.frames.map, [], self._sent)
 
     def update(self, view: MapView) -> bytes | None:
@@ -48,12 +48,12 @@ class PathUpdates:
 
         None if there are none.
         """
-        now, old = view.trajectory(), self._sent[view.first_keyframe - self._first :]
+        now, old = view.trajectory(), self._sent[view.keyframes.first - self._first :]
         changed = np.ones(len(now), dtype=bool)
         if len(old):
             changed[: len(old)] = self._moved(view.space.dimensions, old, now[: len(old)])
         which = np.flatnonzero(changed)
-        self._sent, self._first = old, view.first_keyframe
+        self._sent, self._first = old, view.keyframes.first
         if not len(which):
             return None
         self._sent = np.concatenate((old.reshape(-1, now.shape[1]), now[len(old) :]))

@@ -50,7 +50,7 @@ class UnseenWay:
     def goes_on(self, view: MapView) -> "UnseenWay":
         """Return the distance after an update."""
         count, changes = len(view.keyframes), view.landmark_changes
-        since = max(self.keyframes - 1 - view.first_keyframe, 0)
+        since = max(self.keyframes - 1 - view.keyframes.first, 0)
         positions = view.keyframes.poses[since:, : view.space.dimensions]
         steps = np.diff(positions, axis=0)
         length_m, direction = self.length_m, self.direction
@@ -171,7 +171,7 @@ def estimate_of(slam: GraphSlam, **known: Any) -> Estimate:
         findings=tuple(_found(slam)),
         condensed=condensed_text(condensed_part(view)),
         gyro=str(view.gyro or ""),
-        calibration=_calibration(view.found_settings, view.contradicted),
+        calibration=_calibration(view.corrections.lines(), view.trials.contradicted()),
         **known,
     )
 
@@ -183,7 +183,7 @@ def _found(slam: GraphSlam) -> Iterator[Finding]:
         yield Finding("elsewhere", "error", text=str(view.displaced), follows=("contradicted", "ids_renewed"))
     yield from of_map(
         {
-            "uncorrected": [one.as_dict() for one in view.uncorrected_so_far],
+            "uncorrected": [one.as_dict() for one in view.trials.uncorrected_so_far()],
             "gyro": view.gyro and asdict(view.gyro),
             "association": view.association_report,
             "rivals": [asdict(one) for one in view.backend.rivals],

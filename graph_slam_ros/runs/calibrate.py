@@ -25,7 +25,7 @@ from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import CODES, Fitted, setting_of
 from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS, Parameter, parameters_of
-from graph_slam_ros.slam.trial_fits import FIRST_DUE
+from graph_slam_ros.slam.noise.factors import FIRST_DUE
 from graph_slam_ros.warmup import warmup
 
 _HIDES = "nothing is calibrated, for what is found hides this"
@@ -184,10 +184,10 @@ class _Rounds:
             if (one.verdict == "admitted" and one.parameter not in self._withdrawn)
             or (are_followed and one.is_determined and one.parameter in self._corrected and abs(one.value) > one.sigma)
         }
-        more = view.found_settings | dict(setting_of(one, values, view.calibrated) for one in values)
+        more = view.corrections.lines() | dict(setting_of(one, values, view.corrections.total) for one in values)
         doubted = {one.parameter for one in findings if are_followed and not one.is_determined} & self._corrected
         for one in doubted:
-            self.out.settings.pop(setting_of(one, {one: 0.0}, view.calibrated)[0], None)
+            self.out.settings.pop(setting_of(one, {one: 0.0}, view.corrections.total)[0], None)
         self._withdrawn |= doubted
         self._corrected = (self._corrected | values.keys()) - doubted
         before, self.out.settings = self.out.settings, self.out.settings | more

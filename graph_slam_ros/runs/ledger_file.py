@@ -155,7 +155,7 @@ def ledger_entries(view: MapView, ids: Sequence[int]) -> Iterator[Entry]:
             landmark,
             vertices,
             keyframe,
-            newest_ns or stamps_ns[max(keyframe - view.first_keyframe, 0)],
+            newest_ns or stamps_ns[max(keyframe - view.keyframes.first, 0)],
             measured,
             information,
             tuple(residuals[end - dof : end]),

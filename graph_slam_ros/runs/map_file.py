@@ -149,7 +149,7 @@ def _told(state: MapSnapshot) -> Told:
         "labels": graph.labels,
         "sources": graph.sources,
         "next": {"vertex": vertex.later, "edge": edge.later},
-        "first": state.first_keyframe,
+        "first": state.keyframes.first,
         "frozen": [vertex.first_from(state.frozen), edge.first_from(state.ledger.final)],
         "held": [vertex.first_from(state.held[0]), edge.first_from(state.held[1])],
         "datum": state.datum,

@@ -66,7 +66,7 @@ def fitted_summary(view: MapView) -> dict[str, Any]:
         out["uncorrected"] = [one.as_dict() for one in off]
     if renewed := view.renewed_ids():
         out["renewed_ids"] = str(renewed)
-    if contradicted := view.contradicted:
+    if contradicted := view.trials.contradicted():
         out["contradicted"] = contradicted
     try:
         return out | {"noise": [one.as_dict() for one in view.backend.noise_scale()]}
@@ -83,7 +83,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
     optional = {
         "survey_unseen": sorted(view.config.survey.keys() - view.landmarks.keys()),
         "gyro": view.gyro and asdict(view.gyro),
-        "calibrated": view.found_settings,
+        "calibrated": view.corrections.lines(),
         "association": _association(view),
         "contested": _contested(view),
     }
@@ -119,8 +119,8 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
 def condensed_part(view: MapView) -> dict[str, Any]:
     """Return how many keyframes have left the map, or why none does where some should."""
     settings = view.config.map
-    if view.first_keyframe:
-        return {"condensed": view.first_keyframe}
+    if view.keyframes.first:
+        return {"condensed": view.keyframes.first}
     is_long = settings.condense and len(view.keyframes) > settings.window_keyframes
     is_doubtful = view.association_report.get("is_doubtful", False)
     why = view.config.not_condensed or ("a doubtful map of landmarks without ids" if is_doubtful else "")
@@ -141,7 +141,7 @@ def _association(view: MapView) -> dict[str, Any]:
     report, clock = view.association_report, QUANTITIES["clock"]
     for topic, one in report.get("clocks", {}).items():
         is_found = abs(one["value"]) > max(SIGMAS * one["sigma"], clock.least) and one["sigma"] < clock.determined_below
-        value = view.calibrated(topic, "clock") + one["value"]
+        value = view.corrections.total(topic, "clock") + one["value"]
         one["setting"] = f"{topic}.offset_s={value:.4g}" if is_found else ""
     return report
 
@@ -230,7 +230,7 @@ def _by_input(view: MapView, edges: Index) -> tuple[Counter[str], Counter[str]]:
 def _drives(view: MapView) -> list[dict[str, int]]:
     """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0."""
     of, state = view.sighting_poses.ids, view.bounded or BoundedState()
-    rows = {first: state.sightings + int(np.sum(of < first)) for first in view.drives if first >= view.first_keyframe}
+    rows = {first: state.sightings + int(np.sum(of < first)) for first in view.drives if first >= view.keyframes.first}
     return [{"keyframe": first, "sighting": rows.get(first, state.begins.get(first, 0))} for first in view.drives]
 
 
@@ -243,7 +243,7 @@ def numbered(view: MapView) -> tuple[list[int], str]:
     names: list[tuple[int, int, str, int | str, str]] = []
     for one in view.bounded.old if view.bounded else ():
         names.append((one.number, one.vertex, "keyframe", one.stamp_ns, str(one.number)))
-    for k, keyframe in enumerate(view.keyframes, start=view.first_keyframe):
+    for k, keyframe in enumerate(view.keyframes, start=view.keyframes.first):
         names.append((k, keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
     for k, (name, landmark) in enumerate(view.landmarks.items(), start=len(view.keyframes)):
         names.append((k, landmark.vertex, "landmark", "", name))

@@ -13,10 +13,11 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Fix
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import as_matrix, axes_unknown
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_RAD
 from graph_slam_ros.typing import Array, Numbers
 
 TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
-_UNCERTAIN_M, _UNCERTAIN_RAD = 1e3, 3.0  # anywhere in a town, any heading
+_UNCERTAIN_M = 1e3  # anywhere in a town
 _TILT_RAD = 0.3  # of odometry in space, whose z axis points up; positions do not tell it before the robot has moved
 
 
@@ -81,7 +82,7 @@ class Anchor:
         wanted = self._position()
         T_new_old = self._shifted(np.array(known.position) - at[:n])
         if len(at) > n and not self._config.anchor.sigma_rad:
-            wanted[n:] = _UNCERTAIN_RAD
+            wanted[n:] = JUMP_SIGMA_RAD
             T_new_old = _floats(group.compose(known.pose, group.inverse(tuple(at.tolist()))))
         looser = self._looser(wanted)
         return looser is not None and self._move(T_new_old, looser)
@@ -100,7 +101,7 @@ class Anchor:
     def _position(self) -> Array:
         """The sigmas (dof,) that positions determine."""
         n, angles = self._space.dimensions, self._space.dof - self._space.dimensions
-        return np.array([_UNCERTAIN_M] * n + [_TILT_RAD] * (angles - 1) + [_UNCERTAIN_RAD])
+        return np.array([_UNCERTAIN_M] * n + [_TILT_RAD] * (angles - 1) + [JUMP_SIGMA_RAD])
 
     def _determined_by(self, m: Fix) -> Array:
         """The sigmas (dof,) that a fix determines, by its kind; zero for those that it does not."""
@@ -108,9 +109,9 @@ class Anchor:
         out = self._position()
         match m.kind:
             case "pose":
-                out[n:] = _UNCERTAIN_RAD
+                out[n:] = JUMP_SIGMA_RAD
             case "attitude":
-                out[:n], out[n:] = 0.0, _UNCERTAIN_RAD
+                out[:n], out[n:] = 0.0, JUMP_SIGMA_RAD
             case "heading":
                 out[:-1] = 0.0
             case _:

@@ -310,7 +310,6 @@ class Backend:
             fresh.update()
         vars(self.solver).update(vars(fresh))
         self.handed_over = handed_over
-        self.decisions.recount()
         return None
 
     def withdraw(self, edges: Sequence[int], reason: Reason = Reason.WITHDRAWN, *, vertex: int | None = None) -> None:
@@ -360,7 +359,6 @@ class Backend:
         """Remove all other vertices and edges from the graph."""
         self.solver.keep(vertices, edges)
         self.ledger.keep(edges)
-        self.decisions.recount()
         self._rivals = ()
         self.cancel_search()
 

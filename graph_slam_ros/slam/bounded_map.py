@@ -21,7 +21,7 @@ from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, seen_from
+from graph_slam_ros.slam.lifelong.condenser import CHAIN, ENOUGH, Condensed, Condenser, RemovedPose, seen_from
 from graph_slam_ros.slam.lifelong.place import Cell
 from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.robust.gating import CANDIDATES
@@ -30,11 +30,8 @@ from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.typing import Index
 
 CONDENSED, EXPIRED = "condensed", "expired"
-BATCH = 200  # keyframes that leave the window together
+BATCH = 200  # keyframes that leave the window together, at most those of one visit, and those that wait for its end
 _VISITS, _BACKLOG = 4, 300  # most visits of an update, or it takes long; unless so many keyframes are to leave
-_ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell
-LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are one, and as little is cut as can be
-_PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _AGAIN = 20  # keyframes until it is tried again, where sightings without ids are not explained yet
 _SOURCE = "map"  # of what is counted
 _SUMMED = (PLACES, CHAIN)  # edges that a later one contains, when it takes their place
@@ -111,7 +108,7 @@ class BoundedMap:
         self._tried = 0  # keyframes at the last try
 
     @property
-    def is_due(self) -> bool:
+    def _is_due(self) -> bool:
         """Return whether so many keyframes are out of the window that some should leave."""
         keyframes, config = self._frontend.path.keyframes, self._frontend.config
         is_long = len(keyframes) - keyframes.first >= config.map.window_keyframes + BATCH
@@ -124,11 +121,14 @@ class BoundedMap:
         return min(len(path.keyframes) - window, path.remembered_from)
 
     def condense(self) -> Condensation | None:
-        """Condense what has left the window, if all that was seen there is explained; returns what has left the map.
+        """Condense what has left the window, if that is due; returns what has left the map.
 
-        A failure is counted, and changes nothing.
+        It waits until all is judged, solved and explained, and nothing goes on that could change a verdict. A failure
+        is counted, and changes nothing.
         """
         backend, keyframes = self._backend, self._frontend.path.keyframes
+        if not (self._is_due and backend.is_quiet and self._doubt.now is None and self._solution.is_whole):
+            return None
         if not self._landmarks.anonymous.may_forget_before(self._limit):
             self._tried = len(keyframes) + _AGAIN
             return None
@@ -155,7 +155,7 @@ class BoundedMap:
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / width).astype(np.int64).tolist()))
         marks, k, room = seen_from(self._space, solver, ids), 0, _VISITS if limit < _BACKLOG else limit
         while k < limit and room:
-            longest = min(k + LONGEST, begins[bisect_right(begins, k)])  # a visit is of one segment
+            longest = min(k + BATCH, begins[bisect_right(begins, k)])  # a visit is of one segment
             end = k + _length(marks[k:longest], cells[k:longest])
             if max(end, k + 1) > limit:
                 break
@@ -165,7 +165,7 @@ class BoundedMap:
                 k += 1
                 continue
             visit = ids[k:end].tolist()
-            waits = limit - end < _PATIENCE
+            waits = limit - end < BATCH
             ahead = self._seen_between(*ids[[end, begins[bisect_right(begins, end)] - 1]].tolist())
             done = self.condenser.condense(visit, int(ids[end]), cells[k], ahead, waits=waits)
             if done.how == "waits":
@@ -293,7 +293,7 @@ def _length(marks: Sequence[set[int] | None], cells: Sequence[Cell]) -> int:
     """
     seen = set[int]()
     for k, (some, cell) in enumerate(zip(marks, cells, strict=True)):
-        if some is None or (cell != cells[0] and len(seen) >= _ENOUGH):
+        if some is None or (cell != cells[0] and len(seen) >= ENOUGH):
             return k
         seen |= some
     return len(marks)

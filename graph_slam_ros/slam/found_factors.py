@@ -15,12 +15,12 @@ from graph_slam_ros.slam.calibration.answers import SIGMAS, Fitted
 from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.levels import DIGITS
 from graph_slam_ros.slam.revision import Remeasured, Revision
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Index
 
-_DIGITS = 12  # of a corrected measurement: the last ones of a sine depend on the machine
 _FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 
@@ -47,7 +47,7 @@ class FoundFactors:
         self._config, self._backend, self._frontend = config, backend, frontend
         self._origins, self._anonymous = landmarks.map.origins, landmarks.anonymous
         self.corrected: list[Fitted] = []
-        self._is_new = not start.keyframe_count
+        self._is_new = not len(start.keyframes)
         frontend.corrections.restore(start.calibration)
         self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.hindsight.found_scales
 
@@ -92,7 +92,7 @@ class FoundFactors:
         now = {(one.source, one.name): value for one, value in values.items()}
         corrections.found = before | {key: before.get(key, 1.0) * (1.0 + value) for key, value in now.items()}
         for rows, poses in origins:
-            self._origins.T_keyframe_base[rows] = poses
+            self._origins.rows["T_keyframe_base"][rows] = poses
         self._anonymous.rescale(factors_of(values))
         return applied.report
 
@@ -123,4 +123,4 @@ def _is_used(one: Parameter, value: float, sigma: float, *, is_corrected: bool) 
 
 
 def _exact(numbers: Array) -> Array:
-    return np.round(numbers, _DIGITS)
+    return np.round(numbers, DIGITS)

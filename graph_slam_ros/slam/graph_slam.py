@@ -34,7 +34,6 @@ from graph_slam_ros.slam.background import run_when_asked
 from graph_slam_ros.slam.bounded_map import BoundedMap
 from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.edits import Edits
-from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
@@ -42,7 +41,6 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.map_view import MapView
-from graph_slam_ros.slam.policies import Policies
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.slam.trial_fits import TrialFits
@@ -82,23 +80,21 @@ class GraphSlam:
         path = KeyframeList(OdometryNoise(config.odometry, config.space), config.space)
         backend = Backend(path, config.robust, config.solver_settings(), start, counters, executor)
         landmarks = LandmarkFrontend(config, backend, counters, executor)
-        solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map))
         frontend = KeyframeFrontend(config, path, backend.noise, counters, backend.solver, start.datum)
         doubt = OdometryDoubt(config, backend, counters, landmarks.anonymous, start)
+        trials = TrialFits(config, backend, frontend, landmarks, doubt, counters, executor, len(start.keyframes))
+        found = FoundFactors(config, backend, frontend, landmarks, start)
+        solution = Solution(backend, frontend, landmarks, doubt, trials, found, counters)
         self._backend, self._frontend, self._landmarks = backend, frontend, landmarks
         self._doubt, self._solution, self._anchor = doubt, solution, Anchor(config, backend)
         self.settings = dict[str, Value]()
         self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
-        found = FoundFactors(config, backend, frontend, landmarks, start)
-        first = start.keyframe_count
-        trials = TrialFits(config, backend, frontend, landmarks, doubt, counters, executor, first)
         self.view = MapView(backend, frontend, landmarks, doubt, solution, trials, found, self.settings)
         if start.keyframes:
             self._restore(start)
-        bounded = BoundedMap(backend, frontend, landmarks, self._anchor, doubt, solution, counters)
-        self._policies = Policies(backend, frontend, landmarks, doubt, trials, found, bounded, solution)
+        self._bounded = BoundedMap(backend, frontend, landmarks, self._anchor, doubt, solution, counters)
         self._updates, self.processed = UpdateLog(self.view), 0
 
     def __repr__(self) -> str:
@@ -120,7 +116,7 @@ class GraphSlam:
         check_space(measurement, self.view.space.dimensions)
         self._sink(measurement)
         self.processed += 1
-        self._updates.begin(self._policies.condense())
+        self._updates.begin(self._bounded.condense())
         with self._collected():
             self._process(measurement)
         if self._faults:
@@ -227,14 +223,12 @@ class GraphSlam:
         self._solution.guard.note_moved()
 
     def _solve_if_due(self) -> None:
-        if self._solution.is_due(self._frontend.config.solve.every_keyframes):
+        if self._solution.is_due:
             self._solve()
 
     def _solve(self, everything: Settings | None = None) -> None:
-        """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
         if self.view.keyframes:
-            covariance = self._solution.solve(lambda: self._policies.solve(everything))
-            self._frontend.covariance = self._frontend.covariance if covariance is None else covariance
+            self._solution.solve(everything)
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         match event:

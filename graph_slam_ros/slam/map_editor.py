@@ -49,7 +49,7 @@ class MapEditor:
     def __init__(self, state: MapSnapshot, config: Config) -> None:
         self.state, self._graph, self._ledger, self._marks = state, state.graph, state.ledger, state.landmarks
         self._space, self._gate = config.space, config.robust.gate
-        self._newest = state.keyframe_count - 1
+        self._newest = len(state.keyframes) - 1
         self._out: list[int] = []  # edges that the present edit has taken out
 
     def apply(self, edit: Edit) -> None:
@@ -65,7 +65,7 @@ class MapEditor:
         try:
             if any(one.edit.name == edit.name for one in state.edits):
                 raise GraphSlamError("the map has an edit of that name already")
-            if state.first_keyframe and edit.do not in _IF_CONDENSED:
+            if state.keyframes.first and edit.do not in _IF_CONDENSED:
                 raise GraphSlamError(_WHY["condensed_in_map"])
             self._apply(edit.do, dict(edit.arguments))
         except GraphSlamError as error:
@@ -328,7 +328,7 @@ class MapEditor:
 
     def _at(self, place: int | str) -> int:
         """The number of a keyframe that is there, or of that nearest to a stamp."""
-        first, end = self.state.first_keyframe, self.state.keyframe_count
+        first, end = self.state.keyframes.first, len(self.state.keyframes)
         if isinstance(place, int):
             if place < first:
                 raise GraphSlamError(f"keyframe {place}: {_WHY['condensed_in_map']}")

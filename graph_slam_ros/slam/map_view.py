@@ -42,6 +42,8 @@ class MapView:
     Attributes
     ----------
     backend : the graph, its solver and the verdicts on its edges
+    trials : trial fits in the background: what is off
+    corrections : factors of odometry that the association found, and what is configured
     """
 
     def __init__(
@@ -57,7 +59,7 @@ class MapView:
     ) -> None:
         self.backend, self._frontend, self._landmarks = backend, frontend, landmarks
         self._doubt, self._solution, self._settings = doubt, solution, settings
-        self._trials, self._found_factors = trials, found_factors
+        self.trials, self._found_factors, self.corrections = trials, found_factors, frontend.corrections
 
     def __repr__(self) -> str:
         counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
@@ -91,11 +93,6 @@ class MapView:
         return self._frontend.path.keyframes
 
     @property
-    def first_keyframe(self) -> int:
-        """The number of the first keyframe that was not condensed."""
-        return self.keyframes.first
-
-    @property
     def began_ns(self) -> int:
         """The stamp of the first keyframe of all."""
         return self.bounded.old[0].stamp_ns if self.bounded else self.keyframes[0].stamp_ns
@@ -103,7 +100,7 @@ class MapView:
     @property
     def bounded(self) -> BoundedState | None:
         """The state of a condensed map that is not in its graph; None where nothing was condensed."""
-        return self.backend.bounded if self.first_keyframe else None
+        return self.backend.bounded if self.keyframes.first else None
 
     @property
     def segments(self) -> list[int]:
@@ -150,14 +147,14 @@ class MapView:
 
     @property
     def _sighting_rows(self) -> Index:
-        return self.sighting_poses.ids - self.first_keyframe
+        return self.sighting_poses.ids - self.keyframes.first
 
     def _motions(self, keyframes: Index) -> Numbers:
         """The motion from each of some keyframes, by their rows, to the next as measured, in arrays."""
         odometry, group = self.keyframes.poses, self.space.group
         motion: Numbers = group.between(tuple(odometry[keyframes].T), tuple(odometry[keyframes + 1].T))
         if self._frontend.gyro is None:
-            return self._frontend.corrections.motion(motion)
+            return self.corrections.motion(motion)
         out, ids = np.stack(motion, axis=-1), self.keyframes.ids
         edges = map(self.graph.edge, self.graph.edges_of("odometry").tolist())
         measured = {tuple(edge.vertices): edge.measured for edge in edges}
@@ -240,24 +237,14 @@ class MapView:
         SingularError
             The edges do not determine the estimate.
         """
-        return self._trials.fit(groups, is_to_correct=is_to_correct)
+        return self.trials.fit(groups, is_to_correct=is_to_correct)
 
     def uncorrected(self) -> list[Fitted]:
         """A clock, a mount or a scale that is off by so much that the poses are worse than their covariances say.
 
         A trial fit finds it, on a copy: nothing is changed.
         """
-        return self._trials.uncorrected() if self.is_solved else []
-
-    @property
-    def uncorrected_so_far(self) -> Sequence[Fitted]:
-        """The same of the last trial fit in the background."""
-        return self._trials.uncorrected_so_far()
-
-    @property
-    def contradicted(self) -> list[str]:
-        """Return what is off in the calibration, by parameter: covariances contain it."""
-        return self._trials.contradicted()
+        return self.trials.uncorrected() if self.is_solved else []
 
     @property
     def association_report(self) -> dict[str, Any]:
@@ -272,20 +259,6 @@ class MapView:
         at = self._landmarks.map.positions([one.vertex for one in named])
         names, *ends_ns = zip(*((one.name, one.first_seen_ns, one.last_seen_ns) for one in named), strict=True)
         return renewed_ids(names, at, *map(np.array, ends_ns))
-
-    @property
-    def calibration(self) -> dict[tuple[str, str], float]:
-        """The factors of odometry that the association found, with those that were configured, by input and name."""
-        return self._frontend.corrections.totals()
-
-    def calibrated(self, source: str, name: str) -> float:
-        """The value of a parameter of an input: what is configured, with what was found."""
-        return self._frontend.corrections.total((source, name))
-
-    @property
-    def found_settings(self) -> dict[str, float]:
-        """The parameters of the configuration that have the factors of odometry that the association found."""
-        return self._frontend.corrections.lines()
 
     @property
     def corrected(self) -> Sequence[Fitted]:
@@ -306,7 +279,7 @@ class MapView:
         It is the marginal of the last solve, propagated with the odometry since then.
         """
         covariance = self._frontend.covariance.copy()
-        return self._trials.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
+        return self.trials.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
 
     def landmark_covariances(self, names: Sequence[str] | None = None) -> list[Array]:
         """Marginals of all or some landmarks: of points in map's axes, of poses in tangent space; NaN if unknown."""
@@ -324,7 +297,7 @@ class MapView:
         solved = self._solution.vertices if self.is_solved else 0
         known = [k for k, vertex in enumerate(vertices) if vertex < solved]
         for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
-            out[k] = self._trials.widened(marginal, vertices[k])
+            out[k] = self.trials.widened(marginal, vertices[k])
         return out
 
     # -- the graph and its solution --------------------------------------------------------------------------------
@@ -362,7 +335,7 @@ class MapView:
     @property
     def datum(self) -> tuple[float, ...]:
         """Latitude, longitude [deg] and height [m] of the map's origin, from the first fix; empty: no fix had them."""
-        return self._frontend.datum.datum
+        return self._frontend.gates.datum
 
     def snapshot(self, folder: Any = None) -> MapSnapshot:
         """A copy of the map as it is now. What was condensed is in the run folder that is given."""
@@ -373,7 +346,7 @@ class MapView:
             graph=self.graph.copy(),
             ledger=ledger,
             values=self.solver.values,
-            keyframes=self.keyframes.since(self.first_keyframe),
+            keyframes=self.keyframes.since(self.keyframes.first),
             segments=list(self.segments),
             drives=list(self.drives),
             sighting_poses=self.sighting_poses.since(0),
@@ -387,7 +360,7 @@ class MapView:
             drive=self._frontend.drive,
             noise_factors=dict(self.backend.noise.factors),
             edits=list(self.edits),
-            calibration=self.calibration,
+            calibration=self.corrections.totals(),
             gyro_bias=self._frontend.gyro.saved if self._frontend.gyro else None,
             bounded=bounded.copy() if bounded else None,
             folder=folder,

@@ -71,16 +71,6 @@ class MapSnapshot:
         return deepcopy(self, {id(self.graph): self.graph.copy()})  # kinds are shared
 
     @property
-    def first_keyframe(self) -> int:
-        """The number of the first keyframe: those before were condensed."""
-        return self.keyframes.first
-
-    @property
-    def keyframe_count(self) -> int:
-        """The number of keyframes, condensed ones included."""
-        return len(self.keyframes)
-
-    @property
     def vertices(self) -> list[int]:
         """The vertices of the problem. The others belonged to removed landmarks."""
         poses = set(self.keyframes.ids.tolist())
@@ -99,7 +89,7 @@ class MapSnapshot:
         self.ledger.finish(self.graph.edge_ids.next)
 
     def _prune(self, name: str) -> None:
-        mark, last = self.landmarks.pop(name), self.keyframe_count - 1
+        mark, last = self.landmarks.pop(name), len(self.keyframes) - 1
         for edge in [one.edge for one in mark.seen]:
             self.graph.set_weights(np.array([edge]), 0.0)
             statistic = float(self.ledger.statistic.values[self.ledger.ids.row(edge)])

@@ -1,17 +1,38 @@
-"""The solution: the outcome of the last solve, and the change of map -> odom."""
+"""The solution: solves, and lets each policy look at what is solved; keeps its outcome, and the change of map -> odom.
+
+What may change what was solved, in order. Each change is a ``Revision``, which ``Backend.apply`` does or undoes.
+
+| policy | looks | what it may change |
+|---|---|---|
+| landmarks without identities | at each solve; all scans at 100, 200, 400 ... of them | whose sightings are whose |
+| gates | at each solve | verdicts on edges |
+| second look | where enough edges are out, in the background | verdicts on edges |
+| odometry in doubt | at each solve | a segment begins, or odometry counts for less; taken back, too |
+| noise | at 50, 100, 200 ... keyframes | how much edges count |
+| trial fits | at the same keyframes, in the background | nothing: they say what is off |
+| factors of odometry | where all scans were explained | what odometry and sightings measured |
+| condensing | before a measurement, where nothing goes on | old keyframes become measurements of places |
+
+While an alarm is not decided (``Backend.holds_back``), only what decides it changes the past. Besides these, the
+failure guard takes out what nothing can be solved with, and a person what ``~/remove`` and ``~/clear_closures`` name.
+"""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from graph_slam_ros.errors import DivergedError
-from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.failure_guard import FailureGuard
+from graph_slam_ros.slam.found_factors import FoundFactors
+from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
-from graph_slam_ros.solver import Report
+from graph_slam_ros.slam.trial_fits import TrialFits
+from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Numbers
 
 _BLAMED = 5  # edges that are named as the cause of a correction
@@ -47,15 +68,27 @@ class Solution:
     resting : observations at rest since the last solve
     """
 
-    def __init__(self, space: Geometry, backend: Backend, guard: FailureGuard) -> None:
-        self._space, self._backend, self.guard = space, backend, guard
+    def __init__(
+        self,
+        backend: Backend,
+        frontend: KeyframeFrontend,
+        landmarks: LandmarkFrontend,
+        doubt: OdometryDoubt,
+        trials: TrialFits,
+        found_factors: FoundFactors,
+        counters: Counters,
+    ) -> None:
+        self._space, self._backend, self._frontend = frontend.config.space, backend, frontend
+        self._landmarks, self._doubt = landmarks, doubt
+        self._trials, self._found_factors = trials, found_factors
+        self.guard = FailureGuard(backend, counters, landmarks.map)
         self.solves = 0
         self.report: Report | None = None
         self.correction = Correction()
         self.vertices = self.resting = 0
         self._edges = 0  # the last solve had those below this id
         self._keyframes = 0  # when the last solve was tried
-        self._T_map_odom = space.identity  # by the last solve
+        self._T_map_odom = self._space.identity  # by the last solve
 
     def pose(self, vertex: int) -> Numbers:
         """The present estimate of a pose."""
@@ -99,30 +132,44 @@ class Solution:
         self.vertices, self._edges = self._backend.handed_over
         self.guard.solve(self._backend.solver.update)
 
-    def is_due(self, every_keyframes: int) -> bool:
+    @property
+    def is_due(self) -> bool:
         """Return whether enough is unsolved."""
         keyframes = len(self._backend.path.keyframes)
-        return keyframes - min(self._keyframes, keyframes) + self.resting >= every_keyframes
+        waiting = keyframes - min(self._keyframes, keyframes) + self.resting
+        return waiting >= self._frontend.config.solve.every_keyframes
 
-    def solve(self, work: Callable[[], Report | None]) -> Array | None:
-        """Solve by calling ``work``. Returns the covariance of the newest pose; None if it fails.
-
-        A failure is counted, and the last estimate stays.
-
-        Parameters
-        ----------
-        work : returns the report of a solve of everything
-        """
+    def solve(self, everything: Settings | None = None) -> None:
+        """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
         self._keyframes, self.resting, self.vertices = len(self._backend.path.keyframes), 0, 0
-        solved = self.guard.solve(lambda: (self._fits(), work(), self._covariance()))
+        solved = self.guard.solve(lambda: (self._fits(), self._revised(everything), self._covariance()))
         if solved is None:
-            return None
-        fits, report, covariance = solved
+            return
+        fits, report, self._frontend.covariance = solved
         self.report = report or self.report
         self.solves += 1
         self.vertices, self._edges = self._backend.handed_over
         self._note_correction(fits)
-        return covariance
+
+    def _revised(self, everything: Settings | None) -> Report | None:
+        """Solve, and let each policy look; return the report of a solve of everything."""
+        backend, frontend, keyframes = self._backend, self._frontend, self._backend.path.keyframes
+        self._doubt.add(backend.handed_over[1], frontend.now_ns)
+        if self._landmarks.is_anonymous:
+            self._landmarks.anonymous.review(everything=everything is not None)
+        report = None
+        if everything is None:
+            backend.update()
+            self._doubt.check(frontend.now_ns)
+        else:
+            self._doubt.rejoin(keyframes[-1].stamp_ns)
+            report = backend.optimize(everything)
+        if not backend.holds_back:
+            report = backend.scale_noise(everything) or report
+        self._trials.after_solve(is_of_everything=everything is not None)
+        if not backend.holds_back:
+            report = self._found_factors.after_solve(everything) or report
+        return report
 
     def _covariance(self) -> Array:
         (covariance,) = self._backend.solver.marginal([self._newest.vertex])

@@ -30,12 +30,11 @@ from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.doubt.evidence import LOG_ODDS
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.levels import DIGITS
+from graph_slam_ros.slam.noise.factors import FIRST_DUE
 from graph_slam_ros.typing import Array, Executor, Index
 
-FIRST_DUE = 50  # keyframes
 _DOUBTS = 4  # in recorded drives odometry is rightly in doubt up to twice
-_DIGITS = 12  # of an added variance: the last ones of a sine depend on the machine
-_DONE_IN = 20  # keyframes, in which a trial is done in the background: fewer than until anything is condensed
 _SOURCE = "calibration"  # of what is counted
 _MOST_POSES = 100  # whose covariances say whether what is not corrected matters
 
@@ -70,7 +69,7 @@ class TrialFits:
         self._due, self._due_slips = FIRST_DUE, _DOUBTS
         after = config.robust.apply_after_keyframes
         self._background = Background[Fits | None](_SOURCE, executor, after, counters)
-        self._of_window = Background[Fits | None](_SOURCE, executor, _DONE_IN, counters)  # before anything is condensed
+        self._of_window = Background[Fits | None](_SOURCE, executor, after, counters)  # before anything is condensed
         self._fits: Fits | None = None
         self._contradicting: TrialFit | None = None
         self._so_far: tuple[Fits | None, list[Fitted]] = (None, [])  # what the newest outcome says
@@ -167,7 +166,7 @@ class TrialFits:
         found, dof = self._contradicting, len(marginal)
         if found is None:
             return marginal
-        return marginal + np.round(found.adds(self._known(vertex, dof, found.column), dof), _DIGITS)
+        return marginal + np.round(found.adds(self._known(vertex, dof, found.column), dof), DIGITS)
 
     def _known(self, vertex: int, dof: int, column: Index) -> int:
         """A vertex that a trial had: a pose after it counts as the last keyframe before."""
@@ -235,4 +234,4 @@ class TrialFits:
         vertices = keyframes[np.isin(keyframes, self._solver.vertices)]
         vertices = vertices[:: max(1, -(-len(vertices) // _MOST_POSES))]
         covariances = dict(zip(vertices.tolist(), self._solver.marginal(vertices), strict=True))
-        return uncorrected(fits[0], self._judged(fits[0]), covariances, lambda *key: total(key), self._stated())
+        return uncorrected(fits[0], self._judged(fits[0]), covariances, total, self._stated())

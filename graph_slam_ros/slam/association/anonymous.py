@@ -29,10 +29,10 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.levels import GATE
 from graph_slam_ros.slam.revision import Revision
 from graph_slam_ros.typing import Array, Executor
 
-_GATE_SAME = 0.9999  # probability of the chi2 test within which an observation may belong to a landmark
 _REVIEWED_EVERY = 10  # keyframes, some seconds: landmarks are confirmed and given up
 _POSITIONED = ("position", "pose", "range_bearing")
 
@@ -64,7 +64,7 @@ class AnonymousLandmarks:
         self._history = ScanHistory(space, config.odometry, self._reckoning)
         self._builder = ScanBuilder(space, c.unnamed_sigma_m, c.added_sigma_m)
         self._settings = BeamSettings(
-            quantile(_GATE_SAME, space.dimensions),
+            quantile(GATE, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=40,
         )

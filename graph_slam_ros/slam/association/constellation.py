@@ -5,13 +5,13 @@ from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam.association.presence_check import FIT_M
+from graph_slam_ros.slam.association.scans import FIT_M
 from graph_slam_ros.slam.landmarks.rotations import aligned, yaw
+from graph_slam_ros.slam.levels import SAME_M, SAME_RAD
 from graph_slam_ros.typing import Array, Numbers
 
 _LEAST, _LEAST_APART_M = 4, 2.0  # points of a constellation, and how far two of them are apart
 _MOST_MOTIONS = 4000  # bounds the time: an even sample of them
-_SAME_M, _SAME_RAD = 1.0, 0.3  # poses farther from each other are two
 _BY_CHANCE = 1e-4  # is enough for the displacement search, which decides
 
 Motions = tuple[Array, Array]
@@ -61,8 +61,8 @@ def only_motion(points: Array, places: Array, here: Numbers) -> tuple[Array, Arr
     counts = np.count_nonzero(away < FIT_M, axis=1)
     best = int(counts.argmax())
     positions, angles = turns @ np.array(here[:2]) + moves, np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
-    is_apart = np.linalg.norm(positions - positions[best], axis=1) > _SAME_M
-    is_apart |= np.abs(se2.wrap(angles - angles[best])) > _SAME_RAD
+    is_apart = np.linalg.norm(positions - positions[best], axis=1) > SAME_M
+    is_apart |= np.abs(se2.wrap(angles - angles[best])) > SAME_RAD
     if 2 * int(counts[is_apart].max(initial=0)) > counts[best]:
         return None
     chance = len(places) * np.pi * FIT_M**2 / max(float(np.prod(np.ptp(places, axis=0))), 1.0)

@@ -14,8 +14,9 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.association.assignments import Assignments
 from graph_slam_ros.slam.association.beam import NOTHING, Ids
 from graph_slam_ros.slam.association.constellation import only_motion
-from graph_slam_ros.slam.association.presence_check import FIT_M, is_missing, lost_of
+from graph_slam_ros.slam.association.presence_check import is_missing, lost_of
 from graph_slam_ros.slam.association.scan_history import ScanHistory
+from graph_slam_ros.slam.association.scans import FIT_M
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.typing import Array, Index
 

@@ -11,7 +11,7 @@ from graph_slam_ros.typing import Array
 LEAST_SCANS = 3  # of a landmark
 _MERGE_M = 3.0  # a stretch that lies farther off is laid anew as a whole
 _APART = 0.02  # of the scans of two landmarks, that show both, if they may be one
-_BOTH_AT_MOST = 3  # scans that showed both, that count
+_BOTH_AT_MOST = LEAST_SCANS  # scans that showed both, that count
 _HOPELESS = 4.0  # times what a landmark costs: a merge that costs more by the covariance is not tried
 _BETTER = 4.0  # chi2 by which another landmark fits a cluster better
 _ROUNDS = 6  # of merging and reassigning, which end where nothing changes

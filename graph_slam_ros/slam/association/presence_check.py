@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate
+from graph_slam_ros.slam.association.scans import FIT_M
 from graph_slam_ros.typing import Array, Mask
 
-FIT_M = 0.5  # a cluster nearer to a landmark is of it
 _SAME_DIRECTION_RAD = 0.3  # from what was seen: so near the field of view is known
 _MUCH_MORE = 4.0  # times what the sensor misses; maps that are right reach 2.3
 _LEAST_PART, _LEAST = 0.02, 10  # of what should be seen: fewer say nothing

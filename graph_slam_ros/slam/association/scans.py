@@ -24,10 +24,10 @@ from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15  # of one scan: in it odometry errs by less than the clusters
-NEARBY_S = np.linspace(-0.5, 0.5, 21)
-NEARBY_NS = 500_000_000  # the same as a stamp
+FIT_M = 0.5  # a cluster nearer to a landmark is of it
+NEARBY_NS = SCAN_NS
+NEARBY_S = np.linspace(-NEARBY_NS * 1e-9, NEARBY_NS * 1e-9, 21)
 """Times relative to a scan's stamp, at which its motion by odometry is kept, for clocks that differ."""
-_CLOSE_M = 0.5  # objects of one message this close may be one: two poles of a group, or one of them seen twice
 _SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster
 
 
@@ -342,7 +342,8 @@ def _clustered(points: Sequence[Array], covariances: Sequence[Array], glimpses: 
         for at, (group, mean) in enumerate(zip(groups, means, strict=True)):
             first = group[0]
             away = point - mean
-            is_far = float(np.linalg.norm(away)) > _CLOSE_M
+            # nearer they may be one: two poles of a group, or one of them seen twice
+            is_far = float(np.linalg.norm(away)) > FIT_M
             is_other = bool(glimpses[k].sort) and any(glimpses[i].sort not in ("", glimpses[k].sort) for i in group)
             if is_other or (is_far and _same_message(glimpses, group, k)):
                 continue

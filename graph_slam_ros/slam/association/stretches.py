@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from graph_slam_ros.slam.association.constellation import Motions, pair_motions
 from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate, Ids, compressed
 from graph_slam_ros.slam.association.moves import TRIAL, merged, reassigned, sorts_of, without_few
-from graph_slam_ros.slam.association.scans import are_others
+from graph_slam_ros.slam.association.scans import FIT_M, are_others
 from graph_slam_ros.slam.landmarks.rotations import yaw
 from graph_slam_ros.typing import Array, Mask
 
@@ -28,8 +28,7 @@ _TURN_RAD, _MOVE_M = 0.3, 0.6  # sigmas of what odometry errs by in a gap
 _LEAST_CLUSTERS, _LEAST_STRONG = 3, 5  # of a stretch; scans of a landmark that it is laid on
 _MOST_MOVES, _MOST_STRETCHES = 40, 16  # bound the time, as the next two
 _MOST_LOCAL, _MOST_SCORED = 8, 200  # landmarks whose pairs make motions, and motions that are compared by all clusters
-_APART_M = 0.5  # explanations that have a stretch farther apart are two
-_HOPELESS = 60.0  # that much more than before is never mended by giving clusters to others
+_HOPELESS = _NONE  # that much more than before is never mended by giving clusters to others
 
 
 def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
@@ -117,7 +116,7 @@ def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Es
 
 def _are_apart(a: Estimate, b: Estimate, scans: slice) -> bool:
     """Return whether two estimates have a stretch at different places."""
-    return float(np.linalg.norm(a.position[scans] - b.position[scans], axis=1).max()) > _APART_M
+    return float(np.linalg.norm(a.position[scans] - b.position[scans], axis=1).max()) > FIT_M
 
 
 def _solved(drive: Drive, e: Estimate, inside: Ids, of_inside: Ids, scans: slice, turn: Array, move: Array) -> Estimate:

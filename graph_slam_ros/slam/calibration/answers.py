@@ -33,7 +33,7 @@ from typing import Any, Literal
 import numpy as np
 
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Parameter, Values
+from graph_slam_ros.slam.calibration.parameters import BEND, DEGREE, OF_ODOMETRY, Parameter, Values
 from graph_slam_ros.slam.frontend.corrections import AXES
 from graph_slam_ros.typing import Array
 
@@ -227,10 +227,9 @@ LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, ar
 MOST_SCALE = 0.03  # of distances: with more, the map has another size if ranges are wrong, though its poses agree
 BESIDE_BENDS = 0.06  # of the distance where it is another in bends: in recorded robots with right ranges up to 0.05
 MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
-_DEGREE = np.pi / 180.0
 _SIDES = {"x": ("ahead", "back"), "y": ("to the left", "to the right")}
 _AXIS = {"roll": "about the axis ahead ", "pitch": "about the axis to the left ", "yaw": ""}
-_JUMPED = {"clock": 0.08, **dict.fromkeys(_AXIS, 3.0 * _DEGREE)}  # s, rad; recorded robots: 0.04 s, 1.3 degrees
+_JUMPED = {"clock": 0.08, **dict.fromkeys(_AXIS, 3.0 * DEGREE)}  # s, rad; recorded robots: 0.04 s, 1.3 degrees
 
 Total = Callable[[str, str], float]
 """The value of a parameter of an input that measurements are corrected by at present."""
@@ -342,7 +341,7 @@ def _sentence(one: Parameter, value: float, sigma: float, ranges: str) -> str:
         best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
         return f"sightings agree with odometry best {best}, or odometry is stamped as much too {other}"
     if one.name in _AXIS:
-        by = f"{value / _DEGREE:.1f} degrees {_AXIS[one.name]}on the robot (sigma {sigma / _DEGREE:.1f})"
+        by = f"{value / DEGREE:.1f} degrees {_AXIS[one.name]}on the robot (sigma {sigma / DEGREE:.1f})"
         return f"its sensor is turned by {by}"
     if one.name in _SIDES:
         where = _SIDES[one.name][value < 0.0]

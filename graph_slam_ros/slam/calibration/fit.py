@@ -21,13 +21,13 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import VertexKind
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.calibration.rows import Linearization, Rows, TrialProblem
+from graph_slam_ros.slam.noise.scale import LEAST_WEIGHT
 from graph_slam_ros.typing import Array, Index
 
 _ITERATIONS, _CAUTIOUS = 12, 2  # of all, and of the first with the first stage of the losses
 _STILL = 0.02  # of a sigma of each parameter
 _STRIDE_M, _STRIDE_RAD, _STRIDE = 1.0, 0.3, 0.2  # the largest step of a pose, an angle, a parameter
 _BLOCK_S = 30.0  # errors within are taken for alike
-_LOST = 0.1  # of its weight: a sighting with less is not believed
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class _Fit:
             rows.residual,
             rows.landmark,
             rows.stamp_ns,
-            float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0,
+            float(np.mean(rows.weight[sightings] < LEAST_WEIGHT)) if sightings.any() else 0.0,
             -border,
             shift,
             self._linear.column,

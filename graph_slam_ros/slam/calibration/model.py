@@ -141,8 +141,8 @@ class MeasurementModel:
         known, roots = places >= 0, table.sqrt_information.values[rows].copy()
         poses = np.tile(np.array(self._space.identity), (len(rows), 1))
         sensor, stamps = np.zeros((len(rows), n)), stamps_ns.copy()
-        stamps[known], poses[known] = origins.stamp_ns[places[known]], origins.T_keyframe_base[places[known]]
-        sensor[known] = origins.sensor[places[known]]
+        of = origins.rows[places[known]]
+        stamps[known], poses[known], sensor[known] = of["stamp_ns"], of["T_keyframe_base"], of["sensor"]
         found = Sightings(table, rows, source, z, roots, stamps, poses, sensor)
         found.seen[:] = self.from_pose(found, z, self._space.group.inverse(tuple(poses.T)))
         if found.kind in _POINTS:

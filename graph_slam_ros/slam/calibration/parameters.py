@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 DEFAULT_GROUPS = ("factors", "clock", "yaw")
-_DEGREE = math.pi / 180.0
+DEGREE = math.pi / 180.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Quantity:
 
 _LENGTH = ("m", 1.0, 0.05, 0.02, 0.01)
 _NEAR = "turn on the spot between landmarks, some of them to the sides"
-_ANGLE = ("deg", 1.0 / _DEGREE, 0.5, _DEGREE, 0.5 * _DEGREE)
+_ANGLE = ("deg", 1.0 / DEGREE, 0.5, DEGREE, 0.5 * DEGREE)
 _AHEAD = "drive 10 m straight past landmarks, twice"
 _SCALE = ("%", 100.0, 0.2, 0.03, 0.01)
 _NEAR_AND_FAR = "pass landmarks near and far, within one drive"

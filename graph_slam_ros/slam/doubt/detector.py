@@ -24,7 +24,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.association.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.connections import moved_values
-from graph_slam_ros.slam.doubt.displacement import SAME_M, SAME_RAD, DisplacementSearch
+from graph_slam_ros.slam.doubt.displacement import DisplacementSearch
 from graph_slam_ros.slam.doubt.evidence import (
     LOG_ODDS,
     LOG_ODDS_MOVED,
@@ -45,24 +45,24 @@ from graph_slam_ros.slam.doubt.record import (
 )
 from graph_slam_ros.slam.doubt.window import View, Window
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
+from graph_slam_ros.slam.levels import SAME_M, SAME_RAD
 from graph_slam_ros.slam.revision import Replacement, Revision
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Array, Numbers
 
-_VIEWS, _MOST_EDGES = 17, 60  # newest ones that are compared
-_SINCE = (1, 2, 4, 6, 8, 12, 16)  # views before which a slip may have begun
-_AGAIN = (8, 12, 16)  # views before which a slip may have ended
+_SINCE = (1, 2, 4, 6, 8, 12, 16)  # views before which a slip may have begun; before the last three, ended
+_VIEWS, _MOST_EDGES = _SINCE[-1] + 1, 60  # newest ones that are compared
 _PART = 0.05  # of the views cause a comparison at most, but for so many that follow one another:
 _BURST = 20.0  # comparisons one after the other, as at the begin of a slip
 _EVERY, _MORE = 100, 0.2  # keyframes since noise was measured, and as a part of those then: all is looked at
-_SLIP_M_S, _SLIP_RAD_S = 0.35, 0.35  # sigmas of what odometry does not notice: some of an indoor robot's speeds
+_SLIP = 0.35  # m/s, rad/s: sigmas of what odometry does not notice: some of an indoor robot's speeds
 _LASTS_S = 0.5  # correlation time of the errors of a slip
 _LONGEST_S = 1.0  # of one edge; wheels that stand longer do not slip: the robot was carried
 _THRESHOLD = -2.0 * LOG_ODDS  # that the evidence of a slip is compared with
 _OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
 _ALARM = 4  # sightings more for another pose than for odometry's
-_ALARM_LANDMARKS, _ALARM_KEYFRAMES = 2, 2  # one landmark that moved, or one bad image, is no alarm
+_ALARM_FROM = 2  # landmarks, and keyframes: one landmark that moved, or one bad image, is no alarm
 _DECIDED = 10  # sightings more, and twice those for a third pose
 _DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tell as much as three without
 _TRIED = 5  # sightings that are compared with odometry's noise
@@ -264,7 +264,7 @@ class OdometryDoubt:
 
     @staticmethod
     def _is_doubtful(found: DisplacementHypothesis) -> bool:
-        return found.evidence >= _ALARM and found.landmarks >= _ALARM_LANDMARKS and found.keyframes >= _ALARM_KEYFRAMES
+        return found.evidence >= _ALARM and min(found.landmarks, found.keyframes) >= _ALARM_FROM
 
     def _is_beyond_noise(self, found: DisplacementHypothesis) -> bool:
         """Return whether it is beyond noise: else it is a loop closure that odometry's noise explains."""
@@ -388,7 +388,7 @@ class OdometryDoubt:
         own, used = [link.own for link in links], [link.edge for link in links]
         if own == used:
             return
-        graph, firsts = self._backend.graph, _firsts(links, views, _AGAIN)
+        graph, firsts = self._backend.graph, _firsts(links, views, _SINCE[-3:])
         errors, narrower = OdometryErrors(graph, self._backend.solver, used), between(graph, own, used)
         gains = [errors.log_ratio(narrower * (np.arange(len(links)) >= first)[:, None, None]) for first in firsts]
         if not gains or max(gains) <= 0.0:
@@ -565,10 +565,10 @@ def _variances(space: Geometry, kind: str, seconds: float | Array) -> Array:
     n, seconds = space.dimensions, np.minimum(seconds, _LONGEST_S)
     per_s = np.zeros(space.dof)
     if kind == "translation":
-        per_s[:n] = _SLIP_M_S * _OTHERS
-        per_s[0] = _SLIP_M_S
+        per_s[:n] = _SLIP * _OTHERS
+        per_s[0] = _SLIP
     else:
-        per_s[n:] = _SLIP_RAD_S * _OTHERS
-        per_s[-1] = _SLIP_RAD_S
+        per_s[n:] = _SLIP * _OTHERS
+        per_s[-1] = _SLIP
     independent = np.maximum(1.0, _LASTS_S / np.maximum(seconds, 1e-9))
     return np.asarray((np.asarray(seconds)[..., None] * per_s) ** 2 * independent[..., None])

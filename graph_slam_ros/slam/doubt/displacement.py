@@ -20,6 +20,7 @@ from graph_slam_ros.slam.doubt.connections import Connections, connections_acros
 from graph_slam_ros.slam.doubt.record import DisplacementHypothesis, Link
 from graph_slam_ros.slam.doubt.window import REACH_S, Seen, View, Window
 from graph_slam_ros.slam.landmarks.rotations import aligned, are_spread, pose_of
+from graph_slam_ros.slam.levels import SAME_M, SAME_RAD
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Flags = NDArray[np.bool_]
@@ -30,7 +31,6 @@ _FIT = 0.999  # probability with which a true sighting fits the other pose
 _MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
 _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
-SAME_M, SAME_RAD = 1.0, 0.3  # poses farther from each other are two
 _DRIFT = 2.0  # sigmas of odometry
 
 

@@ -19,17 +19,16 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Edge, EdgeType, Graph, VertexKind
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.levels import BY_CHANCE, GATE, PRIOR_DOF
+from graph_slam_ros.slam.noise.scale import LARGEST
 from graph_slam_ros.typing import Array, Index, Numbers
 
-LOG_ODDS = float(np.log(1e-6))  # of a slip within a stretch of odometry, before anything is seen
+LOG_ODDS = float(np.log(BY_CHANCE))  # of a slip within a stretch of odometry, before anything is seen
 LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to one that slipped
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
-_CAP = 0.9999  # an observation beyond this quantile does not fit
 _LINEAR_RAD = 0.1  # by which an observation turns the pose: beyond, it is linearised again
 _MOST_LINEARIZATIONS = 5  # of one observation
-_PRIOR_DOF = 20.0  # degrees of freedom that would say that odometry's noise is as stated
-_LARGEST = 3.0  # as the noise that a run allows for
-_UNKNOWN, _KNOWN = 1.5, 1.2  # all noise may be larger by this factor, where it is not measured and where it is
+UNKNOWN, _KNOWN = 1.5, 1.2  # all noise may be larger by this factor, where it is not measured and where it is
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +234,7 @@ def _observed(what: int | str, one: Edge, places: Sequence[tuple[int, Index]]) -
     """Lay out an observation of vertices that are at these places."""
     covariance, constant = covariance_of(one), 2.0 * float(np.linalg.slogdet(one.sqrt_information)[1])
     at, columns = np.array([[stored for stored, _ in places]]), np.concatenate([columns for _, columns in places])
-    limit = quantile(_CAP, len(covariance))
+    limit = quantile(GATE, len(covariance))
     return _Observed(what, one.type, at, columns, one.measured[None], covariance, constant, limit)
 
 
@@ -244,12 +243,12 @@ def measured_noise(space: Geometry, backend: Backend) -> tuple[Array, float]:
     n, of_odometry, others = space.dimensions, np.ones(space.dof), list[float]()
     for one in backend.noise_scale(("odometry", "landmarks")):
         if one.label == "odometry" and one.dof > 0.0:
-            variance = (one.per_dof * one.dof + _PRIOR_DOF) / (one.dof + _PRIOR_DOF)
+            variance = (one.per_dof * one.dof + PRIOR_DOF) / (one.dof + PRIOR_DOF)
             part = slice(n) if one.part == "position" else slice(n, None)
-            of_odometry[part] = np.maximum(of_odometry[part], np.sqrt(np.clip(variance, 1.0, _LARGEST**2)))
+            of_odometry[part] = np.maximum(of_odometry[part], np.sqrt(np.clip(variance, 1.0, LARGEST**2)))
         elif one.label == "landmarks" and not one.reason:
             others.append(one.factor)
-    return of_odometry, _KNOWN * max([1.0, *others]) if others else _UNKNOWN
+    return of_odometry, _KNOWN * max([1.0, *others]) if others else UNKNOWN
 
 
 def covariance_of(one: Edge) -> Array:

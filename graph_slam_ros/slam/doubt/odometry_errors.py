@@ -11,14 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from graph_slam_ros.graph import Graph
-from graph_slam_ros.slam.doubt.evidence import covariance_of
+from graph_slam_ros.slam.doubt.evidence import UNKNOWN, covariance_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
 
 _OBSERVED = 0.95  # largest eigenvalue of a direction that other measurements observe
 _LEAST = 1e-6  # an eigenvalue below is rounding
-_NOISE_FACTOR = 1.5  # all noise may be larger than stated by this factor
 
 
 class OdometryErrors:
@@ -59,7 +58,7 @@ class OdometryErrors:
 
     def _log_likelihood(self, extra: Array) -> float:
         root = np.linalg.cholesky(np.diag(1.0 + self._variances) + extra)
-        white = np.linalg.solve(root, self._errors / _NOISE_FACTOR)
+        white = np.linalg.solve(root, self._errors / UNKNOWN)
         return float(-np.log(np.diag(root)).sum() - 0.5 * white @ white)
 
 

@@ -22,13 +22,13 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.evidence import covariance_of
 from graph_slam_ros.slam.doubt.record import Link
 from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.levels import BY_CHANCE, GATE
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 _KEYFRAMES = 2000  # whose odometry is kept
 _VIEWS = 50  # that are kept
-_SURE = 1.0 - 1e-6  # probability with which clean measurements raise no alarm
+_SURE = 1.0 - BY_CHANCE  # probability with which clean measurements raise no alarm
 _SUMS = (1, 2, 4, 8, 16)  # views whose innovations are summed
-_CAP = 0.9999  # no innovation counts for more than this quantile: one alone does not decide
 _USUAL, _FEWEST = 200, 30  # newest sightings whose median says how large residuals are, and how many that needs
 _NEWEST, _LEAST = 20, 6  # sightings that are compared for the other alarm
 _PER_LANDMARK = 4  # of them, at most
@@ -233,7 +233,7 @@ class Window:
                 row = ledger.ids.row(one.edge)
                 numbers, statistic = int(ledger.numbers.values[row]), float(ledger.statistic.values[row])
                 self._ratios.append(statistic / quantile(0.5, numbers))
-                view.statistic += min(statistic / usual, quantile(_CAP, numbers))
+                view.statistic += min(statistic / usual, quantile(GATE, numbers))  # one alone does not decide
                 view.numbers += numbers
         self._new.clear()
 

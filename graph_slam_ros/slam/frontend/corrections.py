@@ -70,9 +70,9 @@ class Corrections:
             {"clock": settings.offset_s, "range_factor": settings.range_factor}.get(name, settings.range_offset_m)
         )
 
-    def total(self, key: Key) -> float:
-        """Return the configured value with the factor that was found."""
-        return self.configured(key) * self.found.get(key, 1.0)
+    def total(self, source: str, name: str) -> float:
+        """Return the configured value of a parameter of an input, with the factor that was found."""
+        return self.configured((source, name)) * self.found.get((source, name), 1.0)
 
     def restore(self, totals: Mapping[Key, float]) -> None:
         """Continue with the values of another run, whatever is configured now."""
@@ -80,11 +80,11 @@ class Corrections:
 
     def totals(self) -> dict[Key, float]:
         """Return what was found with what is configured, as ``restore`` expects it."""
-        return {key: self.total(key) for key in self.found}
+        return {key: self.total(*key) for key in self.found}
 
     def lines(self) -> dict[str, float]:
         """Return the configuration parameters that state what was found."""
-        return {f"odometry.{_ODOMETRY[key[1]]}": float(f"{self.total(key):.6g}") for key in self.found}
+        return {f"odometry.{_ODOMETRY[key[1]]}": float(f"{self.total(*key):.6g}") for key in self.found}
 
     # -- odometry ----------------------------------------------------------------------------------------------------
 

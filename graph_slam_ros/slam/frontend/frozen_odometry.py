@@ -9,7 +9,7 @@ from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.typing import Array, Numbers
 
 _SIGMAS, _LEAST_M, _OF_RANGE = 5.0, 0.1, 0.05  # a landmark is elsewhere: all three, the last times its distance
-_FEWEST, _IN_A_ROW = 2, 2  # landmarks, more than half of those seen again, or one that goes on moving; and messages
+_FEWEST = 2  # landmarks, more than half of those seen again, or one that goes on moving; and messages in a row
 
 
 class FrozenOdometry:
@@ -31,7 +31,7 @@ class FrozenOdometry:
         if again:
             self._in_a_row = self._in_a_row + 1 if 2 * sum(again) > len(again) else 0
         self._seen = points | self._seen
-        if self._in_a_row < _IN_A_ROW:
+        if self._in_a_row < _FEWEST:
             return False
         is_sure = self._one_moved or sum(again) >= _FEWEST
         self._seen, self._in_a_row, self._one_moved = points, 0, not is_sure

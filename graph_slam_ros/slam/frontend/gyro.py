@@ -20,15 +20,15 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import AngularVelocity
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise, StationaryDetector
 from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.levels import GATE
 from graph_slam_ros.typing import Numbers
 
 _MOST = 20_000  # messages that odometry has not reached
 _WINDOW_S = 1.0
 _BIAS_WALK = 1e-4  # rad/s/sqrt(s): of a MEMS gyro after its warm-up
 _BIAS_CORRELATION_S = 10.0  # for which an error of the bias counts as one
-_GATE = 0.9999  # of a turn over a second that the gyro measures while wheels stand
 _MEMORY_S = 60.0
-_DOUBTED, _TRUSTED = 0.5, 0.25  # part of the time in turns in which they differ grossly
+_DOUBTED = 0.5  # part of the time in turns in which they differ grossly; half of it, and it is trusted again
 _TURNING_RAD_S = 0.1  # a second with a faster turn is one in which both must turn
 _GROSS = 0.6  # of the larger of both turns: a difference that wheels do not make. A slip by a factor of 2 is 0.5
 _TURNED_S, _EXPLAINED = 5.0, 3.0  # in turns, and chi2 per axis of their difference, above which a gyro may be doubted
@@ -242,7 +242,7 @@ class GyroFusion:
         self._bias = [0.0] * self._axes
         self._bias_variance = [self._config.bias_sigma**2] * self._axes
         self._window: deque[_Step] = deque()
-        self._limit = quantile(_GATE, self._axes)
+        self._limit = quantile(GATE, self._axes)  # of a turn over a second that the gyro measures while wheels stand
         self._turning_s = self._grossly = self._turn_chi2 = 0.0  # over turns of late: their time, and two means
         self._products = [0.0, 0.0]  # of odometry's turn with the gyro's and with itself, over turns of late
         self._is_doubted = False
@@ -375,7 +375,7 @@ class GyroFusion:
         self._turn_chi2 += (chi2 - self._turn_chi2) * part
         for k, one in enumerate((g, o)):
             self._products[k] += (sum(a * b for a, b in zip(o, one, strict=True)) - self._products[k]) * part
-        most = _TRUSTED if self._is_doubted else _DOUBTED
+        most = 0.5 * _DOUBTED if self._is_doubted else _DOUBTED
         is_unexplained = self._turning_s >= _TURNED_S and self._turn_chi2 > _EXPLAINED * self._axes
         self._is_doubted = is_unexplained and self._grossly > most
 

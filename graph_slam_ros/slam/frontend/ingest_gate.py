@@ -11,10 +11,10 @@ from typing import Literal, TypeAlias
 
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Control, Measured, Odometry, Sightings
+from graph_slam_ros.slam.frontend.odometry_selector import UNUSUAL
 
 _SURE_NS, _SURE = 1_000_000_000, 3  # of stamps, and messages: a burst that was held up is shorter
 _AGAIN_NS = 10_000_000_000  # of stamps: an older stamp that came within this time is a repetition, and no jump
-_UNUSUAL = 3.0  # times the motion before: odometry does not go on from there
 _GOES_ON, _APART_M = 0.5, 0.05  # of the way to where odometry was at that stamp; less is no motion to tell by
 Jump: TypeAlias = Literal["time_jump", "clock_step"]
 
@@ -155,7 +155,7 @@ class TimeJumpDetector:
         if then.stamp_ns == m.stamp_ns and then.T_odom_base == m.T_odom_base:
             return None
         apart_m = math.dist(m.T_odom_base[:2], then.T_odom_base[:2])
-        goes_on = moved_m < min(_UNUSUAL * usual_m, _GOES_ON * apart_m) and apart_m > _APART_M
+        goes_on = moved_m < min(UNUSUAL * usual_m, _GOES_ON * apart_m) and apart_m > _APART_M
         self._stepped[m.source] = (self._stepped[m.source] + 1) * goes_on
         if self._stepped[m.source] >= _SURE:
             return "clock_step"

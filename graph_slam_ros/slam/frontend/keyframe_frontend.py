@@ -24,7 +24,7 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.frozen_odometry import FrozenOdometry
-from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain, MaxDistance, ObservationThinning
+from graph_slam_ros.slam.frontend.gates import Gates
 from graph_slam_ros.slam.frontend.gyro import GyroFusion, SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -37,7 +37,6 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
 _UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
-_SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
 _NEAR, _SLOW = 0.15, 3.5  # the same seen from nearer [m, rad] than this is soon for so many times the least interval
 
 
@@ -55,7 +54,6 @@ class KeyframeFrontend:
     config : the present parameters
     path : the keyframes
     sighting_poses : where the robot observed landmarks
-    datum : where on earth the map begins
     order : brings measurements into the order of their stamps
     pending : observations that odometry has not reached
     gates : what an observation passes before it is used
@@ -87,12 +85,7 @@ class KeyframeFrontend:
         self.corrections = Corrections(config)
         self.order = StampOrder(config.ordering, counters, self.corrections.lag_ns)
         self.pending = PendingObservations(config.ordering, self.path, self.odometry, counters)
-        self.datum = DatumGate(datum)
-        self._arrivals = GateChain((self.datum,), counters)
-        self._thinning = ObservationThinning(config, self.path)
-        self.gates = GateChain(
-            (ClosureStart(self.path, self.odometry), MaxDistance(self._space, config.sources), self._thinning), counters
-        )
+        self.gates = Gates(config, path, self.odometry, counters, datum)
         self._frozen = FrozenOdometry(self._noise, self._space)
         self.frozen_ns: int | None = None
         self.edges = PoseEdges(self._space, edges, counters)
@@ -133,7 +126,7 @@ class KeyframeFrontend:
             used = self.odometry.go_on(drive["odometry"])
             self.T_odom_base = used.T_odom_base
             self.order.go_on(used.stamp_ns)
-            self._thinning.go_on(drive["thinning"])
+            self.gates.go_on(drive["thinning"])
             self._observed_from, self._observed = drive["observed"][0], set(drive["observed"][1])
             self._edges.due = tuple(drive["noise_due"])
         self.sighting_poses = sighting_poses
@@ -146,7 +139,7 @@ class KeyframeFrontend:
         return {
             "path": self.path.state,
             "odometry": self.odometry.state,
-            "thinning": self._thinning.state,
+            "thinning": self.gates.state,
             "observed": [self._observed_from, sorted(self._observed)],
             "noise_due": self._edges.due,
         }
@@ -163,7 +156,7 @@ class KeyframeFrontend:
         self.order.forget()
         self.odometry.forget()
         self.path.forget_time()
-        self._thinning.forget_time()
+        self.gates.forget_time()
         if self.gyro:
             self.gyro.forget()
 
@@ -172,7 +165,7 @@ class KeyframeFrontend:
         if isinstance(m, AngularVelocity):
             self._add_to_gyro(m)
             return False
-        return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
+        return self.order.accepts(m) and (isinstance(m, Odometry) or self.gates.accepts(m))
 
     def steps(self, m: Odometry) -> Iterator[Step]:
         """Yield the corrected steps that an odometry message completes."""
@@ -273,7 +266,7 @@ class KeyframeFrontend:
             self._counters.count(self.source.partition("#")[0], "frozen")
             self.frozen_ns = m.stamp_ns
             self._keyframe_at(where, motion)
-            self._thinning.forget_time()
+            self.gates.forget_time()
 
     def where(self, m: Observation) -> PoseAtStamp:
         """Return the pose at an observation; add a keyframe there if odometry's noise since the last one matters."""
@@ -330,14 +323,12 @@ class KeyframeFrontend:
             return False
         c, added_sigma_m = self.config.keyframes, self.config.landmarks.added_sigma_m
         since_s = (where.stamp_ns - newest.start_ns) * 1e-9
-        most = max(c.shared_noise, _SHARED_WHEN_SOON) if since_s < c.min_interval_s else c.shared_noise
+        most = max(c.shared_noise, 1.0) if since_s < c.min_interval_s else c.shared_noise
         if not motion_compensation.motion_noise_dominates(self._space, m, where, most, added_sigma_m):
             return False
         if since_s >= _SLOW * c.min_interval_s or not self._is_repeated(m, where):
             return True
-        return motion_compensation.motion_noise_dominates(
-            self._space, m, where, _SHARED_WHEN_SOON, added_sigma_m, sharpest=True
-        )
+        return motion_compensation.motion_noise_dominates(self._space, m, where, 1.0, added_sigma_m, sharpest=True)
 
     def _is_repeated(self, m: Observation, where: PoseAtStamp) -> bool:
         """Return whether the same was observed since the keyframe from nearly there. Without ids it may be new."""

@@ -14,7 +14,7 @@ from graph_slam_ros.typing import Numbers
 
 JUMP_SIGMA_M, JUMP_SIGMA_RAD = 10.0, 3.0  # of the motion across a jump: any heading, and anywhere within a hall
 _AT_ZERO = 1e-9  # [m, rad]
-_RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
+_RESET, UNUSUAL = 0.1, 3.0  # m, rad; times the motion before: odometry does not go on from there
 _LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed
 _GAP, _LEAST_GAP_NS = 10.0, 2_000_000_000  # times the usual period, at least; recorded robots pause for 1.4 s
 _FASTER, _FROM_REST_M_S = 2.0, 5.0  # times the speed before a gap, or of a car that drove off in it
@@ -189,7 +189,7 @@ class OdometrySelector:
         if abs(T_odom_base[0]) > _AT_ZERO and not is_gap:
             return False
         (far_m, far_rad), (at_m, at_rad), (usual_m, usual_rad) = map(self._size, (motion, T_odom_base, self._last_step))
-        most_m, most_rad = max(_RESET_M, _UNUSUAL * usual_m), max(_RESET_RAD, _UNUSUAL * usual_rad)
+        most_m, most_rad = max(_RESET, UNUSUAL * usual_m), max(_RESET, UNUSUAL * usual_rad)
         is_at_zero = at_m <= most_m and at_rad <= most_rad if is_gap else max(at_m, at_rad) <= _AT_ZERO
         is_far = far_m > most_m  # a heading may be that of a compass, which goes on
         return (is_at_zero and (is_far or far_rad > most_rad)) or (at_m <= _AT_ZERO and is_far)

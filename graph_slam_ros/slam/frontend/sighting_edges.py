@@ -1,72 +1,46 @@
 """The origin of each sighting edge: its stamp, and the poses of robot and sensor relative to its keyframe."""
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import Column
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Index
 
 
 class SightingEdges:
-    """The origin of each sighting edge, in columns that grow, in order of edges.
-
-    Attributes
-    ----------
-    edge, stamp_ns : (n,)
-    T_keyframe_base : (n, size)
-    sensor : (n, dimensions) position of the sensor in the base frame; zeros if the message does not state it
-    """
+    """The origin of each sighting edge, in order of edges."""
 
     def __init__(self, space: Geometry) -> None:
-        self._space = space
-        self._edge, self._stamp_ns = Column(np.int64), Column(np.int64)
-        self._pose, self._sensor = Column(np.float64, space.pose.size), Column(np.float64, space.dimensions)
+        poses = ("T_keyframe_base", "f8", (space.pose.size,)), ("sensor", "f8", (space.dimensions,))
+        self._space, self._rows = space, Column(np.dtype([("edge", "i8"), ("stamp_ns", "i8"), *poses]))
 
     @property
-    def edge(self) -> Index:
-        """Edge ids, a view."""
-        return self._edge.values
+    def rows(self) -> NDArray[Any]:
+        """A row of each edge, a view.
 
-    @property
-    def stamp_ns(self) -> Index:
-        """Stamps, a view."""
-        return self._stamp_ns.values
-
-    @property
-    def T_keyframe_base(self) -> Array:
-        """Poses of the base at the stamp, a view."""
-        return self._pose.values
-
-    @property
-    def sensor(self) -> Array:
-        """Positions of the sensors, a view."""
-        return self._sensor.values
+        ``edge``; ``stamp_ns``; ``T_keyframe_base``, the pose of the base then; ``sensor``, the position of the sensor
+        in the base frame, zeros if the message does not state it.
+        """
+        return self._rows.values
 
     def append(self, edge: int, s: Sighting, where: PoseAtStamp) -> None:
         """Add the origin of an edge."""
-        sensor = (s.T_base_sensor or self._space.identity)[: self._space.dimensions]
-        self.put(edge, where.stamp_ns, where.T_keyframe_base, sensor)
-
-    def put(self, edge: int, stamp_ns: int, T_keyframe_base: ArrayLike, sensor: ArrayLike) -> None:
-        """Add a row."""
-        where = (self._pose, T_keyframe_base, 1), (self._sensor, sensor, 1)
-        Column.extend((self._edge, edge, 1), (self._stamp_ns, stamp_ns, 1), *where)
+        sensor = tuple((s.T_base_sensor or self._space.identity)[: self._space.dimensions])
+        Column.extend((self._rows, (edge, where.stamp_ns, tuple(where.T_keyframe_base), sensor), 1))
 
     def keep(self, edges: Index) -> None:
         """Forget all but these edges."""
-        rows = np.flatnonzero(np.isin(self.edge, edges))
-        for column in (self._edge, self._stamp_ns, self._pose, self._sensor):
-            column.values = column.values[rows]
-
-    def __len__(self) -> int:
-        return len(self._edge)
+        self._rows.values = self.rows[np.isin(self.rows["edge"], edges)]
 
     def places(self, edges: Index) -> Index:
         """Return the row of each edge; -1 if it has none."""
-        if not len(self):
+        known = self.rows["edge"]
+        if not len(known):
             return np.full(len(edges), -1)
-        at = np.minimum(np.searchsorted(self.edge, edges), len(self) - 1)
-        return np.where(self.edge[at] == edges, at, -1)
+        at = np.minimum(np.searchsorted(known, edges), len(known) - 1)
+        return np.where(known[at] == edges, at, -1)

@@ -13,7 +13,7 @@ from graph_slam_ros.typing import Array, Index
 
 LEAST = 4  # sightings of an id that counts, and ids on either side
 _SPANNING = 0.1  # part of the ids of either side that may be seen on both: wrong ones
-_SAME, _NEAR, _NEAR_M = 0.5, 0.5, 1.0  # part of the new ids that lie where others were; how near, in spacings, at most
+_SAME, _NEAR_M = 0.5, 1.0  # part of the new ids that lie where others were, so near, in spacings; at most
 _BY_CHANCE, _SIGMAS = 0.16, 4.0  # part of them that is so near to another by chance, in landmarks that lie at random
 _NEXT = 5  # ids that are new after one, of which the nearest is how far apart landmarks are
 
@@ -72,7 +72,7 @@ def _ended_there(at: Array, first_ns: Index, last_ns: Index) -> tuple[Index, flo
     """(n,) When the first of the ids near each was seen last, itself among them; and what is near [m]."""
     in_order, n = at[np.argsort(first_ns, kind="stable")], len(at) - _NEXT
     apart = [np.linalg.norm(in_order[k : k + n] - in_order[:n], axis=1) for k in range(1, _NEXT + 1)]
-    near_m = min(_NEAR * float(np.median(np.min(apart, axis=0))), _NEAR_M)
+    near_m = min(_SAME * float(np.median(np.min(apart, axis=0))), _NEAR_M)
     a, b = KDTree(at).query_pairs(near_m, output_type="ndarray").T
     ends_ns = last_ns.copy()
     np.minimum.at(ends_ns, a, last_ns[b])

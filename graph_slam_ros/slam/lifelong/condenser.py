@@ -11,6 +11,7 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam.levels import GATE
 from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
 from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, added_place, fit_of
 from graph_slam_ros.slam.lifelong.state import BoundedState
@@ -22,10 +23,8 @@ CLOSURES, FIXES, LANDMARKS = "closures", "fixes", "landmarks"  # labels
 CHAIN = "composed"  # label of edges that are composed of odometry
 ITSELF, PLACE = "it contradicts itself", "it contradicts its place"
 """Why the sightings of a visit are lost."""
-_FEWEST = 3  # ranges or bearings that are enough for a landmark whose visit is condensed
 _MOST_MEMBERS, _MOST_PLACES = 48, 8  # landmarks of one place; places of one cell
-_GATE = 0.9999  # quantile of chi2 above which a visit contradicts itself or its place
-_AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
+ENOUGH = 3  # landmarks of a visit, and of the keyframes after it before odometry is cut; ranges of what is left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +210,7 @@ class Condenser:
         fits = best is not None and len(seen | set(best.place.members)) <= _MOST_MEMBERS
         is_again = fits and best is not None and self._lay(seen & set(best.place.members))
         has_room = len(in_cell) < _MOST_PLACES and self._lay(seen)
-        if is_again and len(self._known() & set(ahead)) < _AHEAD:
+        if is_again and len(self._known() & set(ahead)) < ENOUGH:
             if waits or not has_room:
                 return Condensed("waits")
             is_again = False
@@ -230,7 +229,7 @@ class Condenser:
             )
             if not ends <= set(one.members):
                 raise SingularError("odometry does not determine the visit")
-            if degrees > 0 and chi2 > quantile(_GATE, degrees):
+            if degrees > 0 and chi2 > quantile(GATE, degrees):
                 return self._composed(visit, after, around, ITSELF)
             one = replace(one, information=one.information / self.state.scale.factor)
             if is_again and best is not None:
@@ -268,10 +267,10 @@ class Condenser:
     def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Place, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
         guess = self._between(*self.solver.estimate([at.base, visit[len(visit) // 2]]).tolist())
-        fit = fit_of(self.space, at.place, one, guess, _GATE, at.strikes)
+        fit = fit_of(self.space, at.place, one, guess, GATE, at.strikes)
         if fit.result is not None and (lonely := self._left_alone(around, fit.result.place.members)):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
-        self.state.scale.add(fit.as_is, _GATE)
+        self.state.scale.add(fit.as_is, GATE)
         if (result := fit.result) is None:
             return self._composed(visit, after, around, PLACE)
         now = added_place(self.space, self.solver.graph, at.base, result.place, square_root(result.place.information))
@@ -337,7 +336,7 @@ class Condenser:
         for mark in sorted(around.seen - set(members) - self._known()):
             others = (graph.edge(int(edge)) for edge in self.solver.edges_on(mark) if int(edge) not in around.sightings)
             sizes = [edge.type.residual_size for edge in others if edge.weight]
-            if max(sizes, default=0) < graph.kind_of(mark).dof and len(sizes) < _FEWEST:
+            if max(sizes, default=0) < graph.kind_of(mark).dof and len(sizes) < ENOUGH:
                 out.append(mark)
         return out
 

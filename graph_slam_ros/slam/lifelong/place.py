@@ -15,6 +15,7 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian, Graph, place_edge
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.graph.place import LABEL
+from graph_slam_ros.slam.levels import PRIOR_DOF
 from graph_slam_ros.slam.lifelong.constellation import Constellation, combined, turned
 from graph_slam_ros.slam.lifelong.elimination import (
     marginal_information,
@@ -29,7 +30,6 @@ Cell = tuple[int, ...]
 """A cell of the grid, by which visits and places are found."""
 _STRIKES = 2  # visits in a row that contradict a place in the same landmark: then that begins anew
 _WIDER = (2.0, 4.0, 9.0)  # factors of the variances of a visit that contradicts its place, the first that fits
-_DEGREES = 20  # of freedom that fit, before the first visit
 _CHANGE = 0.05  # of the factor, from which on places are scaled anew
 _STEPS, _STILL = 30, 1e-12  # Gauss-Newton steps of a motion, at most; until it moves by no more [m, rad]
 
@@ -191,7 +191,7 @@ class VisitScale:
 
     def change(self) -> float:
         """Use the factor by all visits so far. Returns by how much it changed; 1 where that is next to nothing."""
-        now = max(1.0, (self.chi2 + _DEGREES) / (self.degrees + _DEGREES))
+        now = max(1.0, (self.chi2 + PRIOR_DOF) / (self.degrees + PRIOR_DOF))
         by = now / self.factor
         if abs(by - 1.0) < _CHANGE:
             return 1.0

@@ -32,6 +32,7 @@ from scipy.optimize import nnls
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.slam.levels import PRIOR_DOF
 from graph_slam_ros.slam.noise.factors import (
     CLASSES,
     PER_M,
@@ -52,18 +53,16 @@ from graph_slam_ros.typing import Array, Index
 ALIKE_NS = 2_000_000_000  # errors that are alike last less: a landmark not seen for so long is passed again
 LEAST_IN_PASS, LEAST_PASSES = 3, 10  # sightings, and passes: of fewer no variance is told
 LEAST_DOF = 200.0  # of a group: below it says too little
-LEAST_DOF_OF_MOTION = 20.0  # of odometry, whose estimate changes the less the less is known
+LEAST_DOF_OF_MOTION = PRIOR_DOF  # of odometry, whose estimate changes the less the less is known
 MOST_OUTLIERS = 0.05  # part of a group: with more, its residuals are not those of noise
 LEAST_WEIGHT = 0.1  # by the loss: an edge with less is an outlier
-SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma
+SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma; an error that is larger, squared, counts as its variance
 _ROUNDING = 1e-6  # degrees of freedom, less of which are rounding: another processor has none
 _MOST_WINDOWS = 100  # the same of windows
 _MOST_SAMPLED = 200  # edges of a group whose leverage is computed: their joint covariances cost most of all
 CONFIGURED_COUNT = 50.0  # steps of odometry: its configured noise counts as that of so many
 _ROUNDS = 4  # of the regression, each weighted by the variances of the last
-_LARGEST_SQUARE = 9.0  # variances: an error that is larger counts as that
-_LEAST, _MOST = 0.1, 3.0  # factor of the configured sigma
-_MOST_VARIANCE = 9.0  # of what is configured, in the mean over all edges
+_LEAST = 0.1  # factor of the configured sigma
 _CONFIGURED = np.array([1.0, 0.0, 0.0])  # components of variance: what is configured, and nothing is added
 _ONLY_LARGER = {
     "fixes": "errors of fixes that last leave no residuals",
@@ -156,7 +155,7 @@ class _Errors:
         Turning adds to a rotation; a position grows with the way alone.
         """
         motions, at = self.motions * [1.0, float(is_rotation), 1.0], self.motions @ now
-        expected = np.minimum(self.square + self.left, _LARGEST_SQUARE * at)
+        expected = np.minimum(self.square + self.left, LARGEST**2 * at)
         for _ in range(_ROUNDS):
             columns = motions / at[:, None]
             size = np.linalg.norm(columns, axis=0)
@@ -170,8 +169,8 @@ class _Errors:
 def _bounded(components: Array, motions: Array) -> Array:
     """Components (3,) whose factor and added variance are within their limits."""
     own, added = motions.sum(axis=0)[0], float((motions[:, 1:] @ components[1:]).sum())
-    share = min(1.0, _MOST_VARIANCE * own / added) if added > 0.0 else 1.0
-    return np.array([np.clip(components[0], _LEAST**2, _MOST**2), *(share * components[1:])])
+    share = min(1.0, LARGEST**2 * own / added) if added > 0.0 else 1.0
+    return np.array([np.clip(components[0], _LEAST**2, LARGEST**2), *(share * components[1:])])
 
 
 @dataclass(slots=True)

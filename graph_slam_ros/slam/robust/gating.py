@@ -23,22 +23,21 @@ from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam.robust.innovation import innovations, likely_together
-from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
+from graph_slam_ros.slam.robust.landmark_support import is_determined, is_needed, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, OUTSIDE, Ledger, Reason, Verdict
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
-_AT_ONCE = 10  # of them, until the first that is likely
 _AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
-_RETESTS = 10  # edges that are out and are tried again at each review: ten innovations cost less than an update
+_RETESTS = 10  # of them at once, and at each review: ten innovations cost less than an update
 _OUT_BELOW = 0.01  # of its weight: what counts for less moves nothing, and is removed
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 _TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
-_TIGHTEST = 0.1  # part of a gate that is left
+_TIGHTEST = 1.0 / _SLACK  # part of a gate that is left
 _REDUNDANT = 0.05  # of a measurement, that others say too: below, its residual says nothing of its noise
 _GROWN = 1.5  # times as many edges: their redundancy is computed again
 
@@ -56,7 +55,6 @@ class OutlierGate:
     def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
         self._config, self._graph, self._solver = config, graph, solver
         self.ledger = Ledger() if ledger is None else ledger
-        self._support = LandmarkSupport(graph, solver, self.ledger.inside)
         self._tightness = Tightness(graph, solver)
         self.is_calibrated = False
         self.gate_scale = self.stated_scale = config.noise_factor**2
@@ -64,10 +62,6 @@ class OutlierGate:
         self._vertices = 0  # those below were in the graph at the last solve
         self._next = 0  # of the accepted, where the next review goes on
         self._next_out = 0  # and of those that are out
-
-    def recount(self) -> None:
-        """Count anew which edges determine each landmark, after verdicts and weights have changed elsewhere."""
-        self._support = LandmarkSupport(self._graph, self._solver, self.ledger.inside)
 
     # -- what is new -------------------------------------------------------------------------------------------------
 
@@ -81,16 +75,14 @@ class OutlierGate:
         limit, judged = self._limits(ids, numbers), self._graph.has_label(ids, CANDIDATES)
         judged &= ~np.isin(ids, list(self._withdrawn))
         self.ledger.enter(keyframe, chi2, numbers, limit, self._solver.residuals_of(ids), judged)
-        for edge in ids[judged].tolist():
-            self._support.count(edge, 1)
         for edge, reason in self._withdrawn.items():
             self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, _judged(self.ledger, edge)[0])
         self._withdrawn.clear()
         pending, unfit = list[int](), set(ids[chi2 > limit].tolist())
         for edge in ids[judged & self._config.decide].tolist():
-            is_unfit = edge in unfit and not self._support.is_needed(edge)  # by what is left of those before it
+            is_unfit = edge in unfit and not is_needed(self._solver, edge)  # by what is left of those before it
             if is_unfit or (not trusts_sightings and self._is_of_known(edge)):
-                self._weigh(edge, is_in=False)
+                self._solver.set_weight(edge, 0.0)
                 self.ledger.put(edge, Verdict.PENDING, Reason.UNLIKELY)
                 pending.append(edge)
         self._vertices = self._graph.vertex_ids.next
@@ -170,7 +162,7 @@ class OutlierGate:
             for edge, fit in zip(edges[other].tolist(), chi2[other].tolist(), strict=True):
                 if not out:
                     self._readmit(edge, keyframe, fit)
-                elif self._support.is_needed(edge):
+                elif is_needed(self._solver, edge):
                     continue
                 else:
                     self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, fit)
@@ -185,8 +177,8 @@ class OutlierGate:
         costs : gets the innovations that were computed, by edge
         """
         nearest = self._nearest()
-        for begin in range(0, len(nearest), _AT_ONCE):
-            some = nearest[begin : begin + _AT_ONCE]
+        for begin in range(0, len(nearest), _RETESTS):
+            some = nearest[begin : begin + _RETESTS]
             costs |= zip(some, self.innovations(some), strict=True)
             for edge in some:
                 if costs[edge] <= _judged(self.ledger, edge)[1] and self._is_likely(edge, costs[edge]):
@@ -252,7 +244,7 @@ class OutlierGate:
                 self.decide(edge, keyframe, Verdict.REJECTED, reason, _judged(self.ledger, edge)[0])
         landmarks = {landmark for edge in edges if (landmark := landmark_of(self._graph, edge)) is not None}
         for landmark in sorted(landmarks):
-            if not self._support.is_determined(landmark):
+            if not is_determined(self._solver, landmark):
                 self._readmit_all(self._solver.edges_on(landmark), keyframe)
 
     def _readmit_all(self, edges: Index, keyframe: int) -> None:
@@ -278,7 +270,7 @@ class OutlierGate:
             if not self.ledger.is_inside(edge):
                 self._readmit(edge, keyframe, _judged(self.ledger, edge)[0])
         for edge in excluded:
-            if self.ledger.is_inside(edge) and not self._support.is_needed(edge):
+            if self.ledger.is_inside(edge) and not is_needed(self._solver, edge):
                 self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, _judged(self.ledger, edge)[0])
 
     def adopt_verdicts(self, other: Ledger, keyframe: int) -> bool:
@@ -304,7 +296,7 @@ class OutlierGate:
             self._readmit(edge, keyframe, *_judged(judge, edge))
             changed += 1
         for edge in edges[~wanted & inside].tolist():
-            if not self._support.is_needed(edge):
+            if not is_needed(self._solver, edge):
                 statistic, threshold = _judged(judge, edge)
                 self.decide(edge, keyframe, Verdict.REJECTED, Reason.OUTVOTED, statistic, threshold)
                 changed += 1
@@ -322,7 +314,7 @@ class OutlierGate:
         for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
             loss = self._solver.settings.last_loss(self._graph.label_of(edge), self._graph.source_of(edge))
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
-            if weight < _OUT_BELOW and not self._support.is_needed(edge):
+            if weight < _OUT_BELOW and not is_needed(self._solver, edge):
                 self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, fit)
             elif weight < 1.0 and ledger.verdict_of(edge) is Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
@@ -423,15 +415,11 @@ class OutlierGate:
         """Change the verdict on an edge that was judged, and its weight with it: nothing else does."""
         is_in = verdict not in OUTSIDE
         if (self.ledger.verdict_of(edge) not in OUTSIDE) != is_in:
-            self._weigh(edge, is_in=is_in)
+            self._solver.set_weight(edge, float(is_in))
         self.ledger.note(edge, keyframe, verdict, reason, statistic, threshold)
 
     def _readmit(self, edge: int, keyframe: int, statistic: float, threshold: float | None = None) -> None:
         self.decide(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic, threshold)
-
-    def _weigh(self, edge: int, *, is_in: bool) -> None:
-        self._solver.set_weight(edge, float(is_in))
-        self._support.count(edge, 1 if is_in else -1)
 
     # -- what is too much --------------------------------------------------------------------------------------------
 

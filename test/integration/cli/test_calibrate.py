@@ -13,8 +13,8 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.runs import calibrate as calibrate_module
 from graph_slam_ros.runs.calibrate import calibrate
-from graph_slam_ros.slam import MapView
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
+from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.tools.simulation import simulate, write_bag
 
 SOAK = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
@@ -56,7 +56,7 @@ def test_a_recording_without_landmarks_determines_nothing_and_says_so(tmp_path, 
 def test_settings_with_which_less_is_believed_are_not_printed(tmp_path, monkeypatch, capsys):
     """A second replay with what was found shows that it does harm: here a sensor that looks the wrong way."""
     monkeypatch.setattr(calibrate_module, "FIRST_DUE", 10**6)
-    monkeypatch.setattr(MapView, "found_settings", {"detections.mount_correction": "0 0 0 0 0 2.0"})
+    monkeypatch.setattr(Corrections, "lines", lambda self: {"detections.mount_correction": "0 0 0 0 0 2.0"})
     bag = str(tmp_path / "drive.mcap")
     write_bag(simulate("warehouse", 3, aisles=2, aisle_m=4.0, laps=1), bag)
     assert main(["calibrate", bag]) == 3

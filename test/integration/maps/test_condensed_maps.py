@@ -57,7 +57,7 @@ def positions(folder):
 
 def test_what_was_condensed_counts_as_believed(run, tmp_path):
     folder, slam, summary = run
-    assert slam.view.first_keyframe > 200
+    assert slam.view.keyframes.first > 200
     told = summary["inputs"]["landmarks"]
     seen = sum(len(m.sightings) for m in measurements(hall(SEED, KEYFRAMES)) if isinstance(m, Sightings))
     assert (told["used"], told["believed"]) == (seen, seen - 1), "one is an outlier"
@@ -92,7 +92,7 @@ def test_an_edge_of_the_window_is_taken_out_and_the_path_stays_whole(run, saved,
     ]
     edited = edit_run(folder, [one | BASE for one in edits], tmp_path / "edited")
     assert edited.losses == []
-    assert slam.view.first_keyframe <= edited.moved[0] < KEYFRAMES
+    assert slam.view.keyframes.first <= edited.moved[0] < KEYFRAMES
     (fit,) = edited.by_hand
     assert fit.edge == slam.view.graph.edge_ids.of(slam.view.graph.edge_count)
     after = SavedGraph(tmp_path / "edited", [])
@@ -161,7 +161,7 @@ def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(tmp_path, names):
     assert (done.losses, done.left_out, done.summary["keyframes"]) == ([], {}, BOTH)
     assert done.summary["inputs"]["landmarks"]["believed"] == done.summary["inputs"]["landmarks"]["used"]
     saved = SavedGraph(tmp_path / "both", [])
-    assert saved.view.first_keyframe > BOTH - 200, "the merged map condenses as the first did"
+    assert saved.view.keyframes.first > BOTH - 200, "the merged map condenses as the first did"
     assert len(saved.view.drives) == 2
     with pytest.raises(GraphSlamError, match="are of the same drive"):
         merge(tmp_path / "both", drive(names[0]), tmp_path / "again")
@@ -195,7 +195,7 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(tmp_path, name, 
     before = SavedGraph(tmp_path / "site", [])
     settings, measured = bounded(map_localize=localize), read_measurements(drive("b"), [])
     slam, _ = record_run(tmp_path / "on", settings, measured, [], read_map(tmp_path / "site"))
-    assert slam.view.first_keyframe > FIRST + 50
+    assert slam.view.keyframes.first > FIRST + 50
     true = np.array([pose[:2] for pose in hall(SEED, BOTH).poses[FIRST:BOTH]])
     assert rms(positions(tmp_path / "on")[FIRST:], true) < 0.1
     after = SavedGraph(tmp_path / "on", [])

@@ -54,7 +54,7 @@ WORSE, AND_M = 1.2, 0.02  # of the error without calibration: more is worse
 def mended(drive, view):
     """The pipeline after a drive with the settings that a fit to it finds; None where it finds nothing."""
     values = {one.parameter: one.value for one in view.trial_fit(is_to_correct=True)[1] if one.verdict == "admitted"}
-    settings = dict(setting_of(one, values, view.calibrated) for one in values)
+    settings = dict(setting_of(one, values, view.corrections.total) for one in values)
     late_ns = round(1e9 * settings.pop("detections.offset_s", 0.0))  # which is applied where messages are read
     moved = [replace(m, stamp_ns=m.stamp_ns + late_ns) if hasattr(m, "sightings") else m for m in drive]
     return driven(sorted(moved, key=lambda m: m.stamp_ns), settings) if values else None

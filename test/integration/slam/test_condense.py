@@ -69,7 +69,7 @@ def both(request):
 def test_the_map_is_small_as_good_and_hardly_surer_and_the_whole_path_is_there(both):
     """docs/lifelong.md has the limits."""
     world, (whole, _), (small, left) = both
-    assert small.first_keyframe > 0.6 * KEYFRAMES
+    assert small.keyframes.first > 0.6 * KEYFRAMES
     assert len(small.solver.vertices) < 0.4 * len(whole.solver.vertices)
     waiting = whole.graph.edge_count - len(whole.ledger)
     assert small.graph.edge_count == len(small.ledger) + waiting < 0.35 * whole.graph.edge_count
@@ -94,7 +94,7 @@ def recorded():
 def test_a_replay_condenses_as_the_live_run_did(recorded, tmp_path):
     folder, slam, _ = recorded
     again, _ = record_run(tmp_path / "again", bounded(), read_measurements(folder, []), [])
-    assert again.view.first_keyframe == slam.view.first_keyframe > 0
+    assert again.view.keyframes.first == slam.view.keyframes.first > 0
     assert again.view.solver.values.tobytes() == slam.view.solver.values.tobytes()
     for name in ("path.tum", "landmarks.csv", "ledger.csv", "sightings.tum", "graph.g2o", "graph_vertices.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
@@ -122,16 +122,16 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
     at_ns = slam.view.keyframes[-1].stamp_ns
     rest = [m for m in longer if m.stamp_ns > at_ns]
     gone_on, summary = record_run(tmp_path / "more", bounded(), [*rest, Control("end")], [], start)
-    assert gone_on.view.first_keyframe > slam.view.first_keyframe
+    assert gone_on.view.keyframes.first > slam.view.keyframes.first
     assert len(read_tum(tmp_path / "more" / "path.tum").stamps_s) == summary["keyframes"] > MORE - 50
     again = read_start(tmp_path / "more")
-    assert again is not None and again.first_keyframe == slam.view.first_keyframe
-    assert read_map(tmp_path / "more").first_keyframe == gone_on.view.first_keyframe
+    assert again is not None and again.keyframes.first == slam.view.keyframes.first
+    assert read_map(tmp_path / "more").keyframes.first == gone_on.view.keyframes.first
 
 
 GOES_ON = {
     "nothing": (lambda slam: None, True),
-    "a trial fit": (lambda slam: slam.view._trials._background.begin(lambda: lambda _: None, 0), True),
+    "a trial fit": (lambda slam: slam.view.trials._background.begin(lambda: lambda _: None, 0), True),
     "a search": (lambda slam: slam.view.backend._background.begin(lambda: lambda _: None, 0), False),
     "an alarm": (lambda slam: setattr(slam.view.backend, "holds_back", True), False),
     "a slip": (lambda slam: slam._doubt.doubts.append(Doubt(0, 20.0, kind="rotation")), False),
@@ -162,7 +162,7 @@ def test_with_closures_all_is_kept_and_the_end_says_why():
     assert Config().condenses
     assert bounded(**LOOPS).not_condensed == "loops.use=closure"
     slam, left = driven(hall(4, WINDOW + 300), bounded(**LOOPS))
-    assert not left and not slam.view.first_keyframe
+    assert not left and not slam.view.keyframes.first
     assert "condensed  nothing: not with loops.use=closure yet" in "\n".join(text(summarize(slam)))
 
 
@@ -174,7 +174,7 @@ def test_a_condensed_map_goes_on_with_closures_and_one_to_a_keyframe_that_has_le
     loops = [Closure(at_ns, one_ns, "loops", (1.0, 0.0, 0.0), covariance) for one_ns in (old_ns, new_ns)]
     for m in [*drive, *loops, Control("end")]:
         more.process(m)
-    assert more.view.first_keyframe == slam.view.first_keyframe
+    assert more.view.keyframes.first == slam.view.keyframes.first
     assert len(more.view.keyframes) > len(slam.view.keyframes) + 80
     assert more.counters.as_dict()["loops"] == {"from_condensed_keyframe": 1}
 
@@ -201,7 +201,7 @@ def test_a_stretch_without_a_place_stays_if_it_has_fixes_else_its_odometry_does(
         whole.process(m)
         slam.process(m)
     old = {one.number for one in slam.view.bounded.old}
-    assert slam.view.first_keyframe > KEYFRAMES - 200
+    assert slam.view.keyframes.first > KEYFRAMES - 200
     assert set(some) <= old
     assert len(old & set(range(260, 340))) >= 70 if some else len(old & set(range(260, 340))) < 5
     assert len(slam.view.graph.edges_of("fixes")) == len(some)
@@ -231,7 +231,7 @@ def test_each_edge_is_explained_by_its_lasting_id_and_the_whole_says_how_much_is
     text = "\n".join(explain_edge(saved, str(place.edge)))
     assert all(f"{saved.landmark_of(vertex)} (" in text for vertex in place.vertices[1:])
     text, places = "\n".join(explain_run(saved)), sum(map(len, slam.view.bounded.places.values()))
-    assert f"condensed: keyframes 0 to {slam.view.first_keyframe - 1}, into {places} places" in text
+    assert f"condensed: keyframes 0 to {slam.view.keyframes.first - 1}, into {places} places" in text
     assert f"{len(left)} condensed (believed" in text
     seen = next(row["landmark"] for row in left if row["landmark"])
     assert "edges are not in the map any more" in "\n".join(explain_edge(saved, seen))
@@ -242,9 +242,9 @@ def test_diff_compares_the_whole_paths(recorded, tmp_path):
     record_run(tmp_path / "whole", config(PLANAR), read_measurements(folder, []), [])
     found = diff(tmp_path / "whole", folder, [])
     assert (found.keyframes.a, found.keyframes.b, found.keyframes.both) == (500, 500, 500)
-    assert found.condensed == (0, slam.view.first_keyframe)
+    assert found.condensed == (0, slam.view.keyframes.first)
     assert 0.0 < found.keyframes_m[0] < found.keyframes_m[1] < 0.2
-    assert f"{slam.view.first_keyframe}  keyframes, whose edges are in places" in "\n".join(found.lines())
+    assert f"{slam.view.keyframes.first}  keyframes, whose edges are in places" in "\n".join(found.lines())
     same = diff(folder, folder, [])
     assert same.is_same
     assert same.edges.a == same.edges.both
@@ -290,7 +290,7 @@ def assert_each_landmark_is_there_once(view, world, least):
 
 def test_the_map_is_small_and_each_landmark_is_there_once(world, without_names):
     slam, folder = without_names
-    assert slam.view.first_keyframe > times(2 * WINDOW, 540)
+    assert slam.view.keyframes.first > times(2 * WINDOW, 540)
     assert len(slam.view.solver.vertices) < times(0.8, 0.4) * (FIRST + 40)
     assert_each_landmark_is_there_once(slam.view, world, least=times(28, 38))
     assert rms(WholePath.of(slam.view, folder).poses()[:, :2], true_path(world, FIRST)) < times(0.25, 0.1)
@@ -303,7 +303,7 @@ def test_a_map_without_names_that_is_taken_up_again_goes_on_condensing(world, wi
     start.continues = True
     rest = drive(world, FIRST, FIRST + LATER)
     more, _ = record_run(tmp_path / "more", unnamed(), [*rest, Control("end")], [], start)
-    assert more.view.first_keyframe > slam.view.first_keyframe + 200
+    assert more.view.keyframes.first > slam.view.keyframes.first + 200
     assert_each_landmark_is_there_once(more.view, world, least=38)
 
 
@@ -340,7 +340,7 @@ def test_a_doubtful_map_is_not_condensed_and_the_end_says_so(world, monkeypatch)
     slam = GraphSlam(unnamed())
     for m in [*drive(world, 0, 300), Control("end")]:
         slam.process(m)
-    assert slam.view.first_keyframe == 0
+    assert slam.view.keyframes.first == 0
     assert "condensed  nothing: not with a doubtful map of landmarks without ids yet" in "\n".join(
         text(summarize(slam))
     )

@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.frontend.gates import MaxDistance
 
 S, RATE = 10**9, 10
 SOURCE = "detections"
@@ -85,24 +83,23 @@ def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions
     assert np.linalg.norm(slam.view.trajectory()[-1][: len(at)] - at) < 0.1
 
 
-def seen_at(*distances, kind="range"):
-    cov = (0.01,) if kind == "range" else (0.01, 0.0, 0.0, 0.01)
-    items = ((d,) if kind == "range" else (d, 0.0) for d in distances)
-    return Sightings(S, SOURCE, tuple(Sighting("a", kind, numbers, cov) for numbers in items))
-
-
-def refused(reach, *distances, **options):
-    within = reach.admit(seen_at(*distances, **options))
-    return len(distances) - (len(within.sightings) if within else 0)
+def refused(limit, *distances, kind="range"):
+    slam, more = GraphSlam(Config.from_mapping(limit)), (0.0,) * (kind == "position")
+    covariance = (0.01, 0.0, 0.0, 0.01) if more else (0.01,)
+    for k in range(3):
+        slam.process(Odometry(k * S, (0.0, 0.0, 0.0)))
+    seen = (Sighting("a", kind, (distance, *more), covariance) for distance in distances)
+    slam.process(Sightings(S, SOURCE, tuple(seen)))
+    slam.process(Control("flush"))
+    return slam.counters[SOURCE, "beyond_max_distance"]
 
 
 def test_a_given_limit_is_kept_to_the_letter_and_a_bearing_has_none():
-    reach = MaxDistance(PLANAR, Config.from_mapping({f"{SOURCE}.max_distance_m": 5.0}).sources)
-    assert refused(reach, 5.0, 5.1, 4.0, kind="position") == 1
-    assert refused(MaxDistance(PLANAR, Config().sources), 9.9e4, 1.1e5) == 1
-    bearing = Sightings(S, SOURCE, (Sighting("a", "bearing", (1.0,), (0.01,)),))
-    assert reach.admit(bearing) == bearing
-    assert reach.admit(seen_at(6.0)) is None
+    limit = {f"{SOURCE}.max_distance_m": 0.5}
+    assert refused(limit, 0.5, 0.51, 0.4, kind="position") == 1
+    assert refused(limit, 0.6) == 1
+    assert refused(limit, 1.0, kind="bearing") == 0
+    assert refused({}, 9.9e4, 1.1e5) == 1
 
 
 def test_a_closure_farther_than_any_is_refused_and_counted():

@@ -46,7 +46,7 @@ def test_what_is_off_is_told_with_its_sigma_covariances_contain_it_and_the_setti
     drive, truth = imperfect_drive_and_truth(faults, seed=seed, seconds=SECONDS)
     slam = driven(drive, settings)
     noise = of_noise(slam.view)
-    assert {sentence.split(" of ")[0] for sentence in slam.view.contradicted} == {
+    assert {sentence.split(" of ")[0] for sentence in slam.view.trials.contradicted()} == {
         *("distance", "turn", "clock", "yaw", "x", "y")
     }
     by_noise = nees(slam.view, truth, noise)
@@ -66,7 +66,7 @@ def test_what_is_off_is_told_with_its_sigma_covariances_contain_it_and_the_setti
     else:
         mended = driven(drive, settings | dict([one.setting]))
     assert not mended.view.uncorrected()
-    assert not mended.view.contradicted
+    assert not mended.view.trials.contradicted()
     assert nees(mended.view, truth, of_noise(mended.view)) < 0.5 * by_noise
 
 
@@ -74,7 +74,7 @@ def assert_the_node_says_so(slam):
     """Trials begin at keyframes 50, 100, 200; what they find is told 20 keyframes later, and corrects nothing."""
     view = slam.view
     assert np.trace(view.pose_covariance) > 2.0 * np.trace(view.solver.marginal(view.keyframes.ids[-1:])[0])
-    (one,) = view.uncorrected_so_far
+    (one,) = view.trials.uncorrected_so_far()
     of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0}
     estimate = estimate_of(slam, correction=view.correction, unseen=UnseenWay(0, 0), **of)
     facts = Facts("active", estimate=estimate)
@@ -92,7 +92,7 @@ def assert_the_node_says_so(slam):
 def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
     slam = driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0])
     assert not slam.view.uncorrected()
-    assert not slam.view.contradicted
+    assert not slam.view.trials.contradicted()
     np.testing.assert_array_equal(slam.view.keyframe_covariances(), of_noise(slam.view))
 
 

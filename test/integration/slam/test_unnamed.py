@@ -325,9 +325,9 @@ def corrected(circle, tmp_path_factory):
 
 def test_the_factor_that_the_association_finds_corrects_the_graph(circle, corrected):
     slam, _ = corrected
-    assert slam.view.calibrated("odometry", "distance") == pytest.approx(1.0 / SCALE, abs=0.015)
-    assert slam.view.calibrated("odometry", "turn") == 1.0, "one circle does not determine it"
-    assert slam.view.found_settings == {"odometry.distance_factor": pytest.approx(1.0 / SCALE, abs=0.015)}
+    assert slam.view.corrections.total("odometry", "distance") == pytest.approx(1.0 / SCALE, abs=0.015)
+    assert slam.view.corrections.total("odometry", "turn") == 1.0, "one circle does not determine it"
+    assert slam.view.corrections.lines() == {"odometry.distance_factor": pytest.approx(1.0 / SCALE, abs=0.015)}
     assert [one.parameter.name for one in slam.view.corrected] == ["distance"] * len(slam.view.corrected)
     assert path_rmse(slam.view, circle) < 0.4
     assert len(slam.view.landmarks) == len(circle.landmarks)
@@ -336,11 +336,10 @@ def test_the_factor_that_the_association_finds_corrects_the_graph(circle, correc
 def test_a_map_has_the_corrected_measurements_and_goes_on_with_its_factors_whatever_is_configured(corrected):
     slam, state = corrected
     assert slam.view.corrected
-    assert state.calibration == slam.view.calibration
+    assert state.calibration == slam.view.corrections.totals()
     for mine, read in zip(slam.view.graph.tables.values(), state.graph.tables.values(), strict=True):
         np.testing.assert_array_equal(read.measured.values, mine.measured.values)
         np.testing.assert_array_equal(read.sqrt_information.values, mine.sqrt_information.values)
     state.values = slam.view.solver.values
     again = GraphSlam(Config.from_mapping(FACTORS | {"odometry.distance_factor": 1.2}), start=state)
-    assert again.view.calibrated("odometry", "distance") == pytest.approx(slam.view.calibrated("odometry", "distance"))
-    assert again.view.calibration == pytest.approx(slam.view.calibration)
+    assert again.view.corrections.totals() == pytest.approx(slam.view.corrections.totals())

@@ -26,7 +26,7 @@ recorder = runs.RunRecorder(folder, settings)
 slam = GraphSlam(settings, recorder.sink)
 rename = os.replace
 def renamed(file, to):
-    is_due = str(to).endswith("map.mcap") and slam.view.first_keyframe > 100 and not os.path.exists(before)
+    is_due = str(to).endswith("map.mcap") and slam.view.keyframes.first > 100 and not os.path.exists(before)
     if is_due:
         shutil.copytree(folder, before)
     rename(file, to)
@@ -54,7 +54,7 @@ def runs(tmp_path_factory):
 
 
 def test_a_killed_run_is_read_as_it_was_with_the_rest_of_its_journal(runs, tmp_path):
-    assert read_map(runs["later"]).first_keyframe > 100
+    assert read_map(runs["later"]).keyframes.first > 100
     summary = recover(runs["later"], tmp_path / "again")
     assert all("ingest.mcap" in loss for loss in summary["losses"])
     stamps = read_tum(tmp_path / "again" / "path.tum").stamps_s

@@ -21,8 +21,7 @@ def standing_in(space, poses, first=0):
     return SimpleNamespace(
         space=space,
         config=Config(),
-        first_keyframe=first,
-        keyframes=SimpleNamespace(stamps_ns=STAMP_NS + first + np.arange(len(poses))),
+        keyframes=SimpleNamespace(first=first, stamps_ns=STAMP_NS + first + np.arange(len(poses))),
         trajectory=lambda: poses,
     )
 

@@ -22,7 +22,7 @@ def test_derivatives_are_the_numeric_ones_and_a_fit_finds_what_was_wrong_and_cha
     # order in that motion: they differ from the numeric ones by 5 % there.
     wrong = driven(imperfect_drive(FAULTS, kind=kind, seconds=60.0), {"odometry.doubt": False})
     for check in (check_parameters, check_unknowns):
-        check(wrong.view._trials.problem())
+        check(wrong.view.trials.problem())
     before, measured = wrong.view.solver.values, [t.measured.values.copy() for t in wrong.view.graph.tables.values()]
     found, findings = wrong.view.trial_fit()
     assert (wrong.view.solver.values == before).all()
