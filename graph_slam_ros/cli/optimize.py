@@ -16,7 +16,7 @@ from graph_slam_ros.errors import GraphSlamError
 if TYPE_CHECKING:
     from graph_slam_ros.graph import Graph, Loss
     from graph_slam_ros.optimization import Solution
-    from graph_slam_ros.solver import Report, Settings, Solver
+    from graph_slam_ros.solver import Settings, Solver
 
 STARTS = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
 STARTS["online"] = "the drive, pose after pose"
@@ -85,8 +85,7 @@ def optimize(args: argparse.Namespace) -> int:
         proof, code, told = import_module("graph_slam_ros.tools.certificate.certify").certified(solution)
     if args.json:
         proved = {"certificate": proof.as_dict()} if proof else {}
-        told_of = {"losses": file.losses, "notes": file.notes}
-        console.show(json.dumps(_answer(report, start, args) | _starts(solution) | told_of | proved))
+        console.show(json.dumps(_answer(solution, args) | proved))
     else:
         start_text = STARTS[start] + ("" if file.has_values else ": the file has no vertex lines")
         console.show(*_optimize_text(solution, start_text, args.loss), *_starts_text(solution), *told.splitlines())
@@ -195,14 +194,6 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
         yield "--lenient"
 
 
-def _starts(solution: "Solution") -> dict[str, Any]:
-    tried = [(one.start, None if one.failure else one.chi2, one.failure) for one in solution.attempts]
-    starts = [dict(zip(("start", "chi2", "failure"), one, strict=True)) for one in tried]
-    worst = [{"edge": edge, "chi2": chi2} for edge, chi2 in solution.worst()] if solution.doubt else []
-    freedom = {"degrees_of_freedom": solution.solver.degrees_of_freedom, "let_go": solution.let_go}
-    return freedom | {"suspicion": solution.suspicion, "doubt": solution.doubt, "worst": worst, "starts": starts}
-
-
 def _starts_text(solution: "Solution") -> Iterable[str]:
     """The text on a suspicious first result: the reason, the results of other starts, and the one that is used."""
     if not solution.suspicion:
@@ -220,11 +211,26 @@ def _starts_text(solution: "Solution") -> Iterable[str]:
         yield "  no other start could be solved: this may be a local minimum"
 
 
-def _answer(report: "Report", start: str, args: argparse.Namespace) -> dict[str, Any]:
+def _answer(solution: "Solution", args: argparse.Namespace) -> dict[str, Any]:
+    report, tried = solution.report, solution.attempts
     names = "chi2_initial", "chi2_final", "cost_initial", "cost_final", "converged", "stop", "method"
-    classes = {name: {"edges": part.edges, "chi2": part.chi2} for name, part in report.classes.items()}
-    settings = {"loss": _loss_text(args.loss), "start": start, "error_map": args.error_map, "classes": classes}
-    return {name: getattr(report, name) for name in names} | {"iterations": len(report.iterations)} | settings
+    return {name: getattr(report, name) for name in names} | {
+        "iterations": len(report.iterations),
+        "loss": _loss_text(args.loss),
+        "start": solution.start,
+        "error_map": args.error_map,
+        "classes": {name: {"edges": part.edges, "chi2": part.chi2} for name, part in report.classes.items()},
+        "degrees_of_freedom": solution.solver.degrees_of_freedom,
+        "let_go": solution.let_go,
+        "suspicion": solution.suspicion,
+        "doubt": solution.doubt,
+        "worst": [{"edge": edge, "chi2": chi2} for edge, chi2 in solution.worst()] if solution.doubt else [],
+        "starts": [
+            {"start": one.start, "chi2": None if one.failure else one.chi2, "failure": one.failure} for one in tried
+        ],
+        "losses": solution.file.losses,
+        "notes": solution.file.notes,
+    }
 
 
 def _optimize_text(solution: "Solution", start: str, loss: "Loss") -> Iterable[str]:

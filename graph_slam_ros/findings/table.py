@@ -292,7 +292,7 @@ CHECKED: dict[str, Row] = {
     "id_reused": _checked(_ID),
     "ids_unsure": _checked(_NO_ID),
     "ids_exchanged": _checked(_ID),
-    "ids_renewed": _checked(_NO_ID),
+    "ids_renewed": _checked(_NO_ID, hides=("contested",)),
     "landmark_moves": _checked("let the detector leave out this id; a run leaves out what contradicts"),
     "landmark_moved": _checked("use landmarks that nobody moves"),
     "map_breaks": _checked("find out whether the robot was carried or slipped"),

@@ -179,7 +179,7 @@ def _add(recording: Recording, one: TopicContents, m: Any, log_ns: int) -> None:
     if one.topic.type in _OF_TYPE:
         _OF_TYPE[one.topic.type](one, m)
     else:  # landmarks of a package that may not be installed
-        one.items += next((len(getattr(m, name)) for name in _ITEMS if hasattr(m, name)), 0)
+        one.items += len(items)
 
 
 def _plain(frame: str) -> str:

@@ -20,7 +20,7 @@ from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.overview.chosen_inputs import Inputs
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.runs.replay import Progress, RecordedRuns
-from graph_slam_ros.runs.suggestion import SuggestedInputs
+from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import CODES, Fitted, setting_of
@@ -79,19 +79,20 @@ def calibrate(
     progress : wraps the sequence of messages
     """
     path, bag = Path(path), open_bag(Path(path))
-    suggested = SuggestedInputs(bag, path, settings or {}, odometry, landmarks)
-    config = with_survey(Config.from_mapping(suggested.settings))
+    settings = dict(settings or {})
+    suggestion = Suggestion(bag, path, odometry, landmarks, settings)
+    config = with_survey(Config.from_mapping(suggestion.assumed | settings))
     words = _words(groups, config)
     warmup(dimensions=config.world.dimensions)
-    rounds = _Rounds(bag, suggested.inputs(config), config, words, progress)
+    rounds = _Rounds(bag, suggestion.inputs(config), config, words, progress)
     rounds.run()
     if not rounds.keyframes:
         raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
     done, named = rounds.out, rounds.named
     if not done.parameters and not done.refused:
         done.parameters = list(_undriven(config, words, rounds.keyframes))
-    wanted = done.settings | dict(settings or {}) | done.settings | named
-    done.command = suggested.suggestion.command(wanted, name="calibrate" if named else "replay")
+    wanted = done.settings | settings | done.settings | named
+    done.command = suggestion.command(wanted, name="calibrate" if named else "replay")
     done.losses, done.warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
     return done
 

@@ -20,7 +20,7 @@ from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.overview.suggested_odometry import ODOMETRY
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import Progress, RecordedRuns
-from graph_slam_ros.runs.suggestion import OF_LANDMARKS, SuggestedInputs, Suggestion
+from graph_slam_ros.runs.suggestion import OF_LANDMARKS, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
 
@@ -70,17 +70,16 @@ def check(
     """
     path, settings = Path(path), dict(settings or {})
     bag = open_bag(path)
-    suggested = SuggestedInputs(bag, path, settings, odometry, landmarks)
-    suggestion = suggested.suggestion
+    suggestion = Suggestion(bag, path, odometry, landmarks, settings)
     found = list(_unused(suggestion, has_landmarks=landmarks is not None))
     if suggestion.trouble and odometry is None and not settings:
         if all(one.severity != "error" for one in found):  # which say why
             text = f"not ready for replay: {suggestion.trouble}"
             found.append(Finding("no_odometry", "error", 0, 1, "topics", text))
         return Checked(in_order(found), "", bag.losses, bag.warnings)
-    config = Config.from_mapping(suggested.settings)
-    inputs = suggested.inputs(config)
-    collector, counters = Collector(config, inputs.topics, suggested.assumed), Counters()
+    config = Config.from_mapping(suggestion.assumed | settings)
+    inputs = suggestion.inputs(config)
+    collector, counters = Collector(config, inputs.topics, suggestion.assumed), Counters()
     runs = RecordedRuns(bag, inputs, config, counters, columns=collector)
     measured = [(number, some) for number, some in progress(runs, runs.count) if some and not quick]
     columns = collector.columns(counters)
@@ -93,7 +92,7 @@ def check(
         found += with_inputs(columns, _trial(without(columns, moving), some))
     perhaps = [f"{name}: {suggestion.unused[name]}" for name in suggestion.perhaps]  # which may have landmarks
     found = [replace(f, text="; ".join([f.text, *perhaps])) if f.code == "no_landmarks" else f for f in found]
-    others = suggestion.settings.keys() - suggested.assumed.keys()
+    others = suggestion.settings.keys() - suggestion.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
     found = of_gyro_or_wheels(found, config.gyro_input)
     return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)

@@ -8,7 +8,7 @@ are there, if its run was killed: the others do not count.
 import base64
 import csv
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,6 @@ from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
-COLUMNS = [field.name for field in fields(CondensedEdge)]
-
 Record = dict[str, Any]
 
 
@@ -36,7 +34,7 @@ def left_records(done: Condensation) -> Iterator[Record]:
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
-        yield {"type": "left_edges", "first": done.first, "table": rows_text(done.edges)}
+        yield {"type": "left_edges", "first": done.first, "table": rows_text(done.edges, CondensedEdge, has_head=False)}
 
 
 def carried(folder: Path, space: Geometry, state: BoundedState) -> list[Record]:
@@ -61,8 +59,9 @@ def _joined(space: Geometry, known: list[Record]) -> Left:
 
 def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
     """Yield the rows of the edges that have left the map of a run, by column."""
+    columns = [field.name for field in fields(CondensedEdge)]
     for record in read_records(folder, CONDENSED, [], "left_edges"):
-        yield from csv.DictReader(io.StringIO(record["table"]), COLUMNS)
+        yield from csv.DictReader(io.StringIO(record["table"]), columns)
 
 
 def _text(rows: Records) -> str:
@@ -73,12 +72,12 @@ def _rows(text: str, kind: np.dtype[np.void]) -> Records:
     return np.frombuffer(base64.b64decode(text), dtype=kind)
 
 
-def rows_text(rows: Iterable[Any], head: Sequence[str] = ()) -> str:
-    """Return dataclasses as rows of a table of edges, below its head if it has one."""
-    out = io.StringIO()
+def rows_text(rows: Iterable[Any], kind: type[Any], *, has_head: bool = True) -> str:
+    """Return dataclasses of a kind as the rows of a table of edges."""
+    out, names = io.StringIO(), [field.name for field in fields(kind)]
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerows([head] if head else [])
-    writer.writerows([_word(getattr(row, field.name)) for field in fields(row)] for row in rows)
+    writer.writerows([names] if has_head else [])
+    writer.writerows([_word(getattr(row, name)) for name in names] for row in rows)
     return out.getvalue()
 
 

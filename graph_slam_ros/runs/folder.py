@@ -13,7 +13,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -81,11 +81,11 @@ def _is_recorded(file: Path) -> bool:
         there = stream.read(len(head))
     if there != head:
         return head.startswith(there)  # torn as it began
-    first = next((r for r in records(file, [], follow=False) if isinstance(r, Schema | Channel)), None)
-    if name[1] == "run":
-        channels = (r for r in records(file, [], follow=False) if isinstance(r, Channel))
-        return first is None or getattr(next(channels, None), "topic", "") in _TOPICS
-    return first is None or getattr(first, "name", "") == SCHEMAS[name[1]]
+    kind = Channel if name[1] == "run" else Schema
+    first = next((r for r in records(file, [], follow=False) if isinstance(r, kind)), None)
+    if isinstance(first, Channel):
+        return first.topic in _TOPICS
+    return first is None or first.name == SCHEMAS[name[1]]
 
 
 def check_run(folder: Path) -> None:
@@ -115,8 +115,7 @@ def is_cut_off(folder: Path) -> bool:
 
 def incomplete_runs(folder: Path) -> list[Path]:
     """Earlier runs that ended before all accepted measurements were processed, the newest first."""
-    earlier = earlier_runs(folder)
-    return [earlier[number] for number in sorted(earlier, reverse=True) if is_incomplete(earlier[number])]
+    return [run for _, run in sorted(earlier_runs(folder).items(), reverse=True) if is_incomplete(run)]
 
 
 def is_incomplete(folder: Path) -> bool:
@@ -177,8 +176,7 @@ def run_config(folder: Path) -> Config:
 
 def changed_since(folder: Path) -> list[str]:
     """Files that differ from those of ``run.json``: from an interrupted save, exchanged, or edited."""
-    out = list(_not_as_saved(folder, "files", lambda file: checksum(read_bytes(file))))
-    out += [change for change in _not_as_saved(folder, "recorded", ends_of) if change not in out]
+    out = list(dict.fromkeys([*_not_as_saved(folder, "files"), *_not_as_saved(folder, "recorded")]))
     if _went_on(folder) or is_incomplete(folder):
         out.append("the run went on after its results were saved: graph_slam recover has those of its end")
     return out
@@ -186,7 +184,7 @@ def changed_since(folder: Path) -> list[str]:
 
 def missing(folder: Path) -> list[str]:
     """The recordings that are missing, or others than when the run was saved."""
-    return list(_not_as_saved(folder, "recorded", ends_of))
+    return list(_not_as_saved(folder, "recorded"))
 
 
 def _went_on(folder: Path) -> bool:
@@ -202,7 +200,7 @@ def _marks(folder: Path, kind: str) -> dict[str, Any]:
     return marks if isinstance(marks, dict) else {}
 
 
-def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
+def _not_as_saved(folder: Path, kind: str) -> Iterator[str]:
     """The files whose checksum differs from the summary's, and those that are missing or unreadable."""
     if not summary_of(folder) and os.path.lexists(folder / SUMMARY):
         yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
@@ -212,7 +210,7 @@ def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> It
             continue
         if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
             try:
-                if mark_of(folder / name) != mark:
+                if mark != (ends_of(folder / name) if kind == "recorded" else checksum(read_bytes(folder / name))):
                     yield f"{name} is not the one that {SUMMARY} was saved with"
             except FileNotFoundError:
                 yield f"{name} is missing, with which {SUMMARY} was saved"

@@ -6,7 +6,7 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from reprlib import repr as shortened
@@ -20,10 +20,9 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.runs.condensed_map import rows_text
 from graph_slam_ros.runs.journal import LEDGER
 from graph_slam_ros.slam import MapView
-from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.typing import Index, Numbers
 
 Ids = tuple[int, ...]
@@ -103,16 +102,6 @@ class Entry:
         upper = np.zeros((self.dof, self.dof))
         upper[np.triu_indices(self.dof)] = self.information
         return upper + np.triu(upper, 1).T
-
-
-def ledger_text(view: MapView, ids: list[int]) -> str:
-    """All edges of the solver as a table; ``ids`` are the numbers of the vertices in the file."""
-    return rows_text(ledger_entries(view, ids), [field.name for field in fields(Entry)])
-
-
-def changes_text(view: MapView) -> str:
-    """The history of all verdicts as a table."""
-    return rows_text(view.ledger.history, [field.name for field in fields(VerdictChange)])
 
 
 def read_ledger(folder: Path) -> list[Entry]:

@@ -26,7 +26,7 @@ from graph_slam_ros.edge_tags import edge_of, tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3, VertexKind
+from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
 from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting, sighting_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
@@ -216,8 +216,7 @@ def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
     graph = _graph(told, columns)
     (frozen, final), held, vertex, edge = told["frozen"], told["held"], graph.vertex_ids.of, graph.edge_ids.of
     first, gyro, condensed = told["first"], told["gyro"], told["condensed"]
-    pose = _pose_of(graph)
-    size = pose.size if pose else 3
+    size = next((kind.size for kind in graph.kinds if kind in GROUPS), 3)
     columns["keyframes/id"] = graph.vertex_ids.of_all(columns["keyframes/id"])
     return MapSnapshot(
         graph=graph,
@@ -314,8 +313,3 @@ def _bounded(graph: Graph, told: Told) -> BoundedState:
         state.places.setdefault(tuple(cell), []).append(place)
     state.old += [OldKeyframe(number, of(vertex), stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]]
     return state
-
-
-def _pose_of(graph: Graph) -> VertexKind | None:
-    """Return the kind of the keyframes; None where there is no vertex."""
-    return next((kind for kind in graph.kinds if kind in GROUPS), None)

@@ -334,7 +334,7 @@ def _of_sightings(summary: Summary) -> Iterator[Finding]:
     landmarks = summary.get("landmarks", 0)
     if landmarks and summary["sightings"] == landmarks:
         yield Finding("not_seen_again", "error", text="no landmark was seen twice, so they correct nothing")
-    contested = {} if summary.get("renewed_ids") else summary.get("contested", {})
+    contested = summary.get("contested", {})
     for name, (out, count) in contested.items() if len(contested) <= _MANY * landmarks else ():
         yield Finding("contested", "warning", text=f"{name}: {out} of {count} sightings are not believed")
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import sys
 import threading
 import time
 from collections import deque
@@ -11,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
 from graph_slam_ros.errors import FormatError
@@ -43,8 +45,7 @@ from graph_slam_ros.runs.journal import (
     RecordWriter,
 )
 from graph_slam_ros.runs.map_file import write_map
-from graph_slam_ros.runs.resource_log import ResourceLog
-from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
+from graph_slam_ros.runs.tables import counted, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView, Measurement, Update
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers
@@ -54,6 +55,9 @@ _BYTES_PER_S = 3e8 / 3600  # of maps, at most: a larger one is written more rare
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
 _JUMPED_GROWTH, _JUMP_M = 1.01, 0.5  # or by a hundredth, when a solve has moved the robot so far
 _TOGETHER = 256  # measurements that are written at once: one by one, as they come, each takes several times as long
+_LOADS = ("keyframes", "cpu_s", "memory_mib", "backlog")
+_MOST_SAMPLES = 200  # of the load: then every second one is dropped, and half as many are added
+_PER_MIB = 2**20 if sys.platform == "darwin" else 2**10  # of the kernel's unit: bytes on macOS, KiB on Linux
 
 
 class RunRecorder:
@@ -205,29 +209,28 @@ class RunRecorder:
 
     def record(self, slam: GraphSlam, update: Update) -> None:
         """Append what an update changed: pose and TF, and the path, the landmarks and the map when that is due."""
-        if not update or not slam.view.keyframes:
+        view = slam.view
+        if not update or not view.keyframes:
             return
-        self._load.add(len(slam.view.keyframes), max(0, self.accepted - slam.processed))
+        self._load.add(len(view.keyframes), max(0, self.accepted - slam.processed))
         with self._writing:
-            if not self._is_ended:
-                self._record(slam, update)
-
-    def _record(self, slam: GraphSlam, update: Update) -> None:
-        if update.condensed is not None:
-            self._left.present().write(list(left_records(update.condensed)))
-        view, stamp = slam.view, slam.view.keyframes[-1].stamp_ns
-        self._write("/tf", results.TF, stamp, results.map_to_odom(view, stamp))
-        self._write("/tf", results.TF, stamp, results.odom_to_base(view))
-        self._write("/pose", results.POSE, stamp, results.pose(view))
-        growth = _JUMPED_GROWTH if view.correction.distance_m > _JUMP_M else _PATH_GROWTH
-        if len(view.keyframes) >= self._path_recorded * growth:
-            self._path_recorded = len(view.keyframes)
-            self._record_map(view)
-        is_due = time.process_time() >= self._map_cpu_s + _TAIL_S and time.monotonic() >= self._map_due_s
-        if is_due and update.keyframes and self._mapping is None:  # between keyframes odometry would be lost
-            self.flush()  # a map is never ahead of what it came of
-            self._map_cpu_s, state = time.process_time(), self._snapshot(slam)
-            self._mapping = self._disk.submit(self._write_map, state)
+            if self._is_ended:
+                return
+            if update.condensed is not None:
+                self._left.present().write(list(left_records(update.condensed)))
+            stamp = view.keyframes[-1].stamp_ns
+            self._write("/tf", results.TF, stamp, results.map_to_odom(view, stamp))
+            self._write("/tf", results.TF, stamp, results.odom_to_base(view))
+            self._write("/pose", results.POSE, stamp, results.pose(view))
+            growth = _JUMPED_GROWTH if view.correction.distance_m > _JUMP_M else _PATH_GROWTH
+            if len(view.keyframes) >= self._path_recorded * growth:
+                self._path_recorded = len(view.keyframes)
+                self._record_map(view)
+            is_due = time.process_time() >= self._map_cpu_s + _TAIL_S and time.monotonic() >= self._map_due_s
+            if is_due and update.keyframes and self._mapping is None:  # between keyframes odometry would be lost
+                self.flush()  # a map is never ahead of what it came of
+                self._map_cpu_s, state = time.process_time(), self._snapshot(slam)
+                self._mapping = self._disk.submit(self._write_map, state)
 
     def _snapshot(self, slam: GraphSlam) -> MapSnapshot:
         return replace(slam.view.snapshot(), processed=max(0, slam.processed - self._before))
@@ -256,7 +259,7 @@ class RunRecorder:
                     self._write_map(self._snapshot(slam))
                 parts: dict[str, Any] = {"recorded": recorded_files(self.folder)}
             parts |= {"unprocessed": max(0, self.accepted - slam.processed), "load": self._load.as_dict()}
-            save_results(self.folder, slam, (summary or {}) | parts, self._refuse_if_ended)
+            save_results(self.folder, slam, (summary or summarize(slam)) | parts, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         return self.folder
@@ -332,6 +335,38 @@ class RunRecorder:
         self._results.present().write(topic, type_name, stamp_ns, cdr)
 
 
+class ResourceLog:
+    """CPU time, memory and backlog at updates, in samples evenly spaced over the run, whatever its length.
+
+    The memory is the most that was resident until then. The backlog of a sample is the largest since the sample
+    before: measurements accepted and not processed.
+    """
+
+    def __init__(self) -> None:
+        self._begun = time.process_time()
+        self._every, self._next, self._backlog = 1, 0, 0
+        self._rows: list[tuple[int, float, float, int]] = []
+
+    def add(self, keyframes: int, backlog: int) -> None:
+        """Add an update, after which there are so many keyframes."""
+        self._backlog = max(self._backlog, backlog)
+        self._next -= 1
+        if self._next > 0:
+            return
+        memory_mib = round(getrusage(RUSAGE_SELF).ru_maxrss / _PER_MIB, 1)
+        self._rows.append((keyframes, round(time.process_time() - self._begun, 3), memory_mib, self._backlog))
+        if len(self._rows) >= _MOST_SAMPLES:
+            self._every *= 2
+            kept = self._rows[1::2]
+            before = self._rows[::2]
+            self._rows = [(*k[:3], max(k[3], b[3])) for k, b in zip(kept, before, strict=True)]
+        self._next, self._backlog = self._every, 0
+
+    def as_dict(self) -> dict[str, list[Any]]:
+        """A column each for keyframes, CPU seconds since the begin, MiB and backlog; nothing without an update."""
+        return {name: [row[k] for row in self._rows] for k, name in enumerate(_LOADS)} if self._rows else {}
+
+
 def save_results(
     folder: Path, slam: GraphSlam, summary: dict[str, Any], check: Callable[[], None] = lambda: None
 ) -> None:
@@ -348,9 +383,7 @@ def save_results(
 
     texts = result_texts(slam.view, WholePath.of(slam.view, folder))
     files = {name: put(name, text) for name, text in texts.items()}
-    fitted = {} if "noise" in summary else fitted_summary(slam.view)
-    contents = {"format": MARK} | summarize(slam) | summary | fitted | {"format": MARK, "files": files}
-    put(SUMMARY, json.dumps(contents, indent=2) + "\n")
+    put(SUMMARY, json.dumps({"format": MARK} | summary | {"files": files}, indent=2) + "\n")
 
 
 def _put(folder: Path, name: str, text: str) -> str:

@@ -23,7 +23,7 @@ from graph_slam_ros.runs.folder import (
 from graph_slam_ros.runs.journal import IN_A_MAP, INGEST, START, read_measurements, read_records
 from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
-from graph_slam_ros.runs.tables import counters_of, fitted_summary, summarize
+from graph_slam_ros.runs.tables import counters_of, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, MapView, Measurement
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.warmup import warmup
@@ -181,7 +181,6 @@ def record_run(
         slam.counters.update(border())
         summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
         summary |= ({"recording": recording} if recording else {}) | more()
-        summary |= fitted_summary(slam.view)
         recorder.save(slam, summary)
     except BaseException as error:
         if recorder is not None and recorder.accepted and not isinstance(error, KeyboardInterrupt):
@@ -220,7 +219,7 @@ def complete(folder: Path) -> Summary:
             before, counters = summary_of(folder), Counters()
             slam = restored_and_solved(folder, losses, counters)
             kept = {key: before[key] for key in _OF_RECORDING if key in before}
-            summary = kept | summarize(slam, counters) | fitted_summary(slam.view) | took()
+            summary = kept | summarize(slam, counters) | took()
             summary |= {"losses": losses, "ended": True, "is_incomplete": False}
             save_results(folder, slam, summary)
     except OSError as error:

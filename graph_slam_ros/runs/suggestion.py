@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from graph_slam_ros.check.gyro import upright
@@ -48,11 +49,13 @@ class Suggestion:
     Parameters
     ----------
     odometry, landmarks : topics; the suggestion is that for a recording in which they are the only ones of their kinds
+    given : parameters by dotted name that the user has chosen: they come before those that are suggested
 
     Attributes
     ----------
     recording : its contents
     settings : parameters that differ from their defaults, by dotted name
+    assumed : those of them that the user has not chosen; none where the inputs are given
     topics, names : of odom and detections; of all inputs
     notes : sentences: what was chosen and why, and what is assumed
     unused : why a topic that could be an input is not offered, by its name
@@ -60,24 +63,28 @@ class Suggestion:
     trouble : why there is no command; empty where there is one
     """
 
-    def __init__(self, bag: Bag, path: Path, odometry: str | None = None, landmarks: str | None = None) -> None:
-        self.recording, self._path = recording_of(bag), path
+    def __init__(
+        self,
+        bag: Bag,
+        path: Path,
+        odometry: str | None = None,
+        landmarks: str | None = None,
+        given: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        has_names = "inputs.names" in given
+        if not has_names:
+            odometry, landmarks = odometry or _topic_of(given, "odom"), landmarks or _topic_of(given, "detections")
+        self._bag, self._path, self._asked = bag, path, (odometry, landmarks)
+        self.recording = recording_of(bag)
         self._recording = _with_only(self.recording, odometry, landmarks)
-        self.settings: dict[str, Any] = {}
-        self.notes: list[str] = []
         self.unused: dict[str, str] = {}
         self.perhaps: list[str] = []
-        self.topics: dict[str, str] = {}  # of odom and detections
-        self.names: list[str] = []
         chosen = OdometryChoice(self._recording, self.unused)
         self._odometry, self._base, self._odom = chosen.contents, chosen.base, chosen.odom
-        self.settings |= chosen.settings
-        self.notes += chosen.notes
-        self.trouble = chosen.trouble
+        self.settings, self.notes, self.trouble = chosen.settings, chosen.notes, chosen.trouble
+        self.topics = {"odom": chosen.topic} if chosen.topic else {}
+        self.names = [] if self.trouble else ["odom"]
         if not self.trouble:
-            self.names.append("odom")
-            if chosen.topic:
-                self.topics["odom"] = chosen.topic
             self._choose_landmarks()
             self._choose_fixes()
             self._finish()
@@ -86,6 +93,17 @@ class Suggestion:
                 choose_inputs(bag, config, self.topics.get("odom"), self.topics.get("detections"))
             except GraphSlamError as error:
                 self.trouble = str(error)
+        self._is_used = not self.trouble and not has_names
+        self.assumed = {name: value for name, value in self.settings.items() if self._is_used and name not in given}
+
+    def inputs(self, config: Config) -> Inputs:
+        """The topics of the inputs of a configuration: named, suggested, configured, or the only ones of their types.
+
+        Raises BagError: a topic does not exist or has another type, or there is none.
+        """
+        used = {one.name for one in config.sources if one.use != "none"} if self._is_used else set[str]()
+        topics, (odometry, landmarks) = {name: self.topics[name] for name in used & self.topics.keys()}, self._asked
+        return choose_inputs(self._bag, config, odometry or topics.get("odom"), landmarks or topics.get("detections"))
 
     def command(
         self, more: Mapping[str, Any] | None = None, without: Collection[str] = (), name: str = "replay"
@@ -200,32 +218,30 @@ class Suggestion:
             self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
 
     def _pose(self, one: TopicContents) -> None:
-        name = one.topic.name
+        name, noise = one.topic.name, {} if one.has_noise else {"sigma_m": 0.1}
         if ESTIMATE.search(name):
             self.unused[name] = "the output of a localiser, or a goal: no measurement"
         elif one.frame == self._odom:
             self.unused[name] = "in the frame of the odometry: it says the same"
         elif one.topic.type == POSE or len(self.names) > 1:
-            self.unused[name] = f"a pose may be an estimate or the truth; as a fix: {self._as_fix(one)}"
+            as_fix = self._as_input("pose", one, frame="map", **noise)
+            self.unused[name] = f"a pose may be an estimate or the truth; as a fix: {as_fix}"
         else:
-            chosen: dict[str, Any] = {} if one.frame == "map" else {"frame": "map"}
-            self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
+            self._add("pose", one, ({} if one.frame == "map" else {"frame": "map"}) | noise, linked=True)
             self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
 
-    def _as_fix(self, one: TopicContents) -> str:
-        """The settings that make a topic of poses a fix, besides the inputs that are chosen."""
-        names, noise = " ".join([*self.names, "pose"]), "" if one.has_noise else " --set pose.sigma_m=0.1"
-        chosen = f"--set pose.type={one.topic.type} --set pose.topic={one.topic.name} --set pose.frame=map{noise}"
-        return f"--set 'inputs.names={names}' {chosen}"
+    def _as_input(self, name: str, one: TopicContents, **more: Any) -> str:
+        """The settings that make a topic an input, too."""
+        own = {"type": one.topic.type, "topic": one.topic.name} | more
+        settings = {"inputs.names": " ".join([*self.names, name])} | {f"{name}.{key}": own[key] for key in own}
+        return " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in settings.items())
 
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
-            names = " ".join([*self.names, "imu"])
             angles = upright(tuple(total / max(one.read, 1) for total in one.felt))
             turn = " ".join(f"{0.0 if abs(angle) < _LEVEL_RAD else angle:.4g}" for angle in angles)
-            mount = "" if self._recording.is_linked(one.frame, self._base) else f" --set 'imu.mount=0 0 0 {turn} 0'"
-            chosen = f"--set 'inputs.names={names}' --set imu.type={IMU} --set imu.topic={one.topic.name}{mount}"
-            as_gyro = f"Its gyro as part of odometry: {chosen} --set imu.use=gyro"
+            mount = {} if self._recording.is_linked(one.frame, self._base) else {"mount": f"0 0 0 {turn} 0"}
+            as_gyro = f"Its gyro as part of odometry: {self._as_input('imu', one, **mount, use='gyro')}"
             if one.usable < 0.5 * one.read:
                 self.unused[one.topic.name] = f"it has no orientation (an IMU with a filter has). {as_gyro}"
             elif not is_needed:
@@ -320,8 +336,7 @@ class Suggestion:
         if is_truth(name) or not one.topic.count:
             return ""
         if of == MARKERS:
-            chosen = f"--set 'inputs.names={' '.join([*self.names, 'markers'])}' --set markers.type={of}"
-            return f"markers are mostly pictures; where they are landmarks: {chosen} --set markers.topic={name}"
+            return f"markers are mostly pictures; where they are landmarks: {self._as_input('markers', one)}"
         if of == GNSS and not one.usable:
             return "no message has a fix"
         if _WITHOUT_ID.search(of):
@@ -338,51 +353,6 @@ def _with_only(recording: Recording, odometry: str | None, landmarks: str | None
     if landmarks in topics:
         topics = {n: one for n, one in topics.items() if n == landmarks or one.topic.type not in OF_LANDMARKS}
     return replace(recording, topics=topics)
-
-
-class SuggestedInputs:
-    """The suggestion for a recording, and what of it holds where the user has chosen some parameters and topics.
-
-    Parameters
-    ----------
-    given : parameters by dotted name, which come before those that are suggested
-    odometry, landmarks : topics, as of a ``Suggestion``
-
-    Attributes
-    ----------
-    suggestion : for the recording
-    assumed : the suggested parameters that the user has not chosen; none where the inputs are given
-    settings : these and the given ones
-    """
-
-    def __init__(
-        self,
-        bag: Bag,
-        path: Path,
-        given: Mapping[str, Any],
-        odometry: str | None = None,
-        landmarks: str | None = None,
-    ) -> None:
-        has_names = "inputs.names" in given
-        if not has_names:
-            odometry, landmarks = odometry or _topic_of(given, "odom"), landmarks or _topic_of(given, "detections")
-        self._bag, self._odometry, self._landmarks = bag, odometry, landmarks
-        self.suggestion = Suggestion(bag, path, odometry, landmarks)
-        is_suggested = not self.suggestion.trouble and not has_names
-        suggested = self.suggestion.settings if is_suggested else {}
-        self._topics = self.suggestion.topics if is_suggested else {}
-        self.assumed = {name: value for name, value in suggested.items() if name not in given}
-        self.settings = self.assumed | dict(given)
-
-    def inputs(self, config: Config) -> Inputs:
-        """The topics of the inputs of a configuration: named, suggested, configured, or the only ones of their types.
-
-        Raises BagError: a topic does not exist or has another type, or there is none.
-        """
-        used = {one.name for one in config.sources if one.use != "none"}
-        topics = {name: topic for name, topic in self._topics.items() if name in used}
-        odometry, landmarks = self._odometry or topics.get("odom"), self._landmarks or topics.get("detections")
-        return choose_inputs(self._bag, config, odometry, landmarks)
 
 
 def _topic_of(given: Mapping[str, Any], name: str) -> str | None:

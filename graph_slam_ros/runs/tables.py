@@ -15,16 +15,16 @@ from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.inputs import recorded_uses
-from graph_slam_ros.runs.condensed_map import WholePath
+from graph_slam_ros.runs.condensed_map import WholePath, rows_text
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.runs.journal import CHANGES, LEDGER
-from graph_slam_ros.runs.ledger_file import changes_text, ledger_text
+from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.slam import Counters, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.state import BoundedState, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
-from graph_slam_ros.slam.robust.ledger import OUTSIDE
+from graph_slam_ros.slam.robust.ledger import OUTSIDE, VerdictChange
 from graph_slam_ros.typing import Index
 
 Name = TypeVar("Name")
@@ -46,8 +46,8 @@ def result_texts(view: MapView, whole: WholePath) -> dict[str, str]:
     return {
         GRAPH: "\n".join([*graph_lines(graph_file(view, ids), view.solver.estimate), ""]),
         VERTICES: vertices,
-        LEDGER: ledger_text(view, ids),
-        CHANGES: changes_text(view),
+        LEDGER: rows_text(ledger_entries(view, ids), Entry),
+        CHANGES: rows_text(view.ledger.history, VerdictChange),
         PATH: tum_text(stamps_ns, path),
         PATH_ODOMETRY: tum_text(stamps_ns, whole.odometry),
         COVARIANCES: _covariance_table(view, whole.left.keyframes["stamp_ns"].tolist()),
@@ -57,7 +57,7 @@ def result_texts(view: MapView, whole: WholePath) -> dict[str, str]:
     }
 
 
-def fitted_summary(view: MapView) -> dict[str, Any]:
+def _fitted(view: MapView) -> dict[str, Any]:
     """The estimated noise, whether it is applied, and the reason if there is none; and what nothing corrects."""
     out: dict[str, Any] = {"noise_scale": view.config.robust.noise_scale, "noise": []}
     if not view.is_solved:
@@ -113,6 +113,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
         | condensed_part(view)
         | {name: value for name, value in optional.items() if value}
         | account(slam, counters)
+        | _fitted(view)
     )
 
 

@@ -66,7 +66,7 @@ def corridor(folder, landmarks=True, length_m=60.0, start=None):
                 slam.process(Sightings((100 + k) * S // 10, "tags", tuple(seen)))
     slam.process(Control("end"))
     recorder.record(slam, slam.process(Control("optimize")))
-    recorder.save(slam, {"ended": True})
+    recorder.save(slam)
     recorder.close()
     return slam
 

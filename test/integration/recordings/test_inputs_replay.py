@@ -14,7 +14,7 @@ from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.runs.suggestion import SuggestedInputs
+from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.slam import Config, Fix, Odometry, Sightings
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -88,11 +88,11 @@ def test_check_and_calibrate_read_the_topics_that_a_replay_reads(tmp_path):
     bag = open_bag(path)
     names = {"inputs.names": "wheels odom", "wheels.type": "nav_msgs/msg/Odometry", "wheels.topic": "wheel/odom"}
     for given in ({"odom.topic": "wheel/odom"}, {"odom.topic": "/wheel/odom"}, names | {"odom.topic": "/odom"}):
-        suggested = SuggestedInputs(bag, path, given)
+        suggested = Suggestion(bag, path, given=given)
         expected = choose_inputs(bag, Config.from_mapping(given)).topics
-        assert suggested.inputs(Config.from_mapping(suggested.settings)).topics == expected
+        assert suggested.inputs(Config.from_mapping(suggested.assumed | given)).topics == expected
     with pytest.raises(BagError, match="no topic /nothing"):
-        SuggestedInputs(bag, path, {"odom.topic": "/nothing"}).inputs(Config.from_mapping({"odom.topic": "/nothing"}))
+        Suggestion(bag, path, given={"odom.topic": "/nothing"}).inputs(Config.from_mapping({"odom.topic": "/nothing"}))
 
 
 def test_transforms_in_the_namespace_of_the_robot_are_read_where_there_are_no_others(tmp_path):
