@@ -34,6 +34,8 @@ SPEAK_MESSAGES = SPEAK_RCLPY | {
 def test_the_version_number_is_the_same_everywhere():
     assert ElementTree.parse(ROOT / "package.xml").findtext("version") == graph_slam_ros.__version__
     assert version("graph_slam_ros") == graph_slam_ros.__version__
+    for file in ("recipe/recipe.yaml", "CITATION.cff"):
+        assert re.findall(r"(?m)^ *version: ([\d.]+)", (ROOT / file).read_text()) == [graph_slam_ros.__version__]
 
 
 def test_everything_but_the_node_imports_without_ros():
@@ -80,7 +82,8 @@ def test_each_planted_bug_changes_something_that_is_there(bug):
         assert f"def {name}(" in (ROOT / test_path(file)).read_text()
 
 
-def test_both_locks_fit_the_requirements():
+def test_both_locks_and_the_recipe_fit_the_requirements():
+    recipe = (ROOT / "recipe/recipe.yaml").read_text()
     latest, oldest = pins("requirements.txt"), pins("constraints-oldest.txt")
     lines = [line for line in requires("graph_slam_ros") if "extra" not in line]
     assert len(lines) > 5
@@ -88,6 +91,7 @@ def test_both_locks_fit_the_requirements():
         name, bound = re.fullmatch(r"([\w.-]+) ?>=([\d.]+)", line).groups()
         name = re.sub(r"[-_.]+", "-", name).lower()
         assert name in latest
+        assert re.search(rf"- {name}(-base)? >={bound}\n", recipe)
         (lowest,) = oldest[name]
         assert [int(part) for part in lowest.split(".")] == [int(part) for part in bound.split(".")]
 
