@@ -95,12 +95,15 @@ setup(
     author_email="maintainers@graph-slam-ros.example",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "kernels-*.zip", "tools/*/page.*", "tools/view/edits*.*"]},
+    package_data={
+        NAME: ["py.typed", "kernels-*.zip", "config/presets/*.yaml", "tools/*/page.*", "tools/view/edits*.*"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
         (f"share/{NAME}/config", sorted(glob("config/*"))),
+        (f"share/{NAME}/config/presets", sorted(glob(f"{NAME}/config/presets/*"))),
     ],
     zip_safe=False,
     distclass=WithKernels,

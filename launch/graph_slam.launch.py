@@ -1,8 +1,12 @@
 """Start the SLAM node: ``ros2 launch graph_slam_ros graph_slam.launch.py odom:=/wheel/odometry rviz:=true``.
 
+With ``preset:=tags image:=/camera/image_rect tag_size:=0.16``, say, a detector of tags as well: apriltag_ros.
+
 A plain node action, not a LifecycleNode: the node brings itself up, or a lifecycle manager does (``autostart:=false``),
 and so this process needs no ROS node of its own.
 """
+
+from typing import Any
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -34,6 +38,13 @@ def _folder(context: LaunchContext) -> dict[str, str]:
     return {"output.folder": folder} if folder else {}
 
 
+def _files(context: LaunchContext) -> list[Any]:
+    """The preset, below the file of parameters; without both the shipped parameters, which are the defaults."""
+    preset, file = (LaunchConfiguration(name).perform(context) for name in ("preset", "params_file"))
+    presets = [_in_config(f"presets/{preset}.yaml")] if preset else []
+    return [*presets, *([file] if file else [])] or [_in_config("planar.yaml")]
+
+
 def _start(context: LaunchContext) -> list[Node]:
     namespace = LaunchConfiguration("namespace")
     slam = Node(
@@ -41,7 +52,7 @@ def _start(context: LaunchContext) -> list[Node]:
         executable="graph_slam_node",
         namespace=namespace,
         parameters=[
-            LaunchConfiguration("params_file"),
+            *_files(context),
             {
                 "use_sim_time": _flag("use_sim_time"),
                 "node.autostart": _flag("autostart"),
@@ -62,15 +73,33 @@ def _start(context: LaunchContext) -> list[Node]:
         parameters=[{"use_sim_time": _flag("use_sim_time")}],
         condition=IfCondition(LaunchConfiguration("rviz")),
     )
-    return [slam, rviz]
+    image = LaunchConfiguration("image").perform(context)
+    camera = image[: image.rfind("/") + 1]
+    detector = Node(
+        package="apriltag_ros",
+        executable="apriltag_node",
+        namespace=namespace,
+        parameters=[
+            {
+                "size": ParameterValue(LaunchConfiguration("tag_size"), value_type=float),
+                "use_sim_time": _flag("use_sim_time"),
+            }
+        ],
+        remappings=[("image_rect", image), ("camera_info", f"{camera}camera_info")],
+        output="screen",
+    )
+    return [slam, rviz, *([detector] if image else [])]
 
 
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node and its topics"),
+            DeclareLaunchArgument("preset", default_value="", description="tags, poles, gnss, ranges or closures"),
             DeclareLaunchArgument(
-                "params_file", default_value=_in_config("planar.yaml"), description="YAML file of parameters"
+                "params_file",
+                default_value="",
+                description="Parameters on top of the preset; without both planar.yaml",
             ),
             DeclareLaunchArgument(
                 "frame_prefix",
@@ -88,6 +117,14 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("odom", default_value="odom", description="Topic of nav_msgs/Odometry"),
             DeclareLaunchArgument("landmarks", default_value="landmarks", description="Topic of Detection3DArray"),
+            DeclareLaunchArgument(
+                "image",
+                default_value="",
+                description="Topic of rectified images: apriltag_ros looks for tags in them",
+            ),
+            DeclareLaunchArgument(
+                "tag_size", default_value="1.0", description="Edge of these tags in metres: distances scale with it"
+            ),
             DeclareLaunchArgument("rviz", default_value="false", description="Open RViz as well"),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
             OpaqueFunction(function=_start),

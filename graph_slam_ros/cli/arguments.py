@@ -158,7 +158,7 @@ def add_inputs(sub: CommandParser, recording: str = "file or folder of a recordi
     sub.add_argument("bag", type=Path, metavar="BAG", help=recording)
     sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
     sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
-    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node, or a preset's name")
     about = "set one parameter, before the file's"
     sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
 

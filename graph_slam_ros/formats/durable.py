@@ -141,10 +141,8 @@ def claimed(folder: Path) -> Iterator[None]:
 def _locked(fd: int) -> bool:
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system that has no locks, or none for folders
-        return True
+    except OSError as error:  # a file system may have no locks, or none for folders
+        return not isinstance(error, BlockingIOError)
     return True
 
 

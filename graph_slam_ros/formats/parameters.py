@@ -12,6 +12,7 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.files import opened
 
 _MAX_BYTES, _MAX_DEPTH, _MAX_NODES = 2**20, 50, 20_000
+_PRESETS = Path(__file__).parents[1] / "config/presets"
 _NODE, _WRAPPER = "graph_slam", "ros__parameters"
 _OF_ANY_NODE = ("use_sim_time", "qos_overrides", "start_type_description_service")  # which rclpy itself reads
 
@@ -87,14 +88,16 @@ def read_parameters(path: Path | str, *, follow: bool = True) -> dict[str, Any]:
     """Nested values of a parameter file; a ROS wrapper (``/**: ros__parameters: ...``) is taken off.
 
     What any node has (``use_sim_time``) is left out. Of a file for several nodes, the section of ``graph_slam``.
-    ``follow``: the file may be a symbolic link.
+    ``follow``: a user names the file: it may be a symbolic link, and the name of a preset stands for its file.
 
     Raises
     ------
     ConfigError
         Naming the file and what is wrong.
     """
-    path = Path(path)
+    path, presets = Path(path), {file.stem: file for file in _PRESETS.glob("*.yaml")} if follow else {}
+    if not path.is_file():
+        path = presets.get(str(path), path)
     try:
         with opened(path, follow=follow) as stream:
             content = stream.read(_MAX_BYTES + 1)
@@ -102,7 +105,8 @@ def read_parameters(path: Path | str, *, follow: bool = True) -> dict[str, Any]:
             raise ConfigError(f"larger than {_MAX_BYTES} bytes")
         values = yaml.load(content.decode("utf-8-sig"), Loader=_StrictLoader)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        known = f"; presets: {', '.join(sorted(presets))}" if presets and not path.suffix else ""
+        raise ConfigError(f"{path}: {error.strerror}{known}") from None
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date like 2001-99-99
@@ -159,8 +163,7 @@ def parameters_text(values: Mapping[str, Mapping[str, Any]], notes: Mapping[str,
     for section, members in values.items():
         lines.append(f"    {section}:")
         for key, value in members.items():
-            note = (notes or {}).get(f"{section}.{key}")
-            if note:
+            if note := (notes or {}).get(f"{section}.{key}"):
                 lines.append(f"      # {note}")
             lines.append(f"      {key}: {_scalar(value)}")
     return "\n".join(lines) + "\n"
@@ -170,6 +173,4 @@ def _scalar(value: Any) -> str:
     if isinstance(value, float):  # YAML 1.1 reads 1e-05 as a text
         text = repr(value)
         return text if "." in text or "e" not in text else text.replace("e", ".0e")
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
+    return json.dumps(value, ensure_ascii=False)

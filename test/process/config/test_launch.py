@@ -7,6 +7,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,7 +31,8 @@ service = LaunchService()
 service.include_launch_description(LaunchDescription([included]))
 sys.exit(service.run())
 """
-NODE, RVIZ, FRAMES = "graph_slam_ros/graph_slam_node", "rviz2/rviz2", ("map", "odom", "base_link")
+NODE, RVIZ, TAGS = "graph_slam_ros/graph_slam_node", "rviz2/rviz2", "apriltag_ros/apriltag_node"
+FRAMES, PRESETS = ("map", "odom", "base_link"), ROOT / "graph_slam_ros/config/presets"
 RUN_NODE = "import sys\nfrom graph_slam_ros.cli import node_main\nsys.exit(node_main())"
 TELL = """
 import json, pathlib, sys
@@ -44,17 +46,14 @@ def arguments():
     for call in ast.walk(ast.parse(FILE.read_text())):
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "DeclareLaunchArgument":
             given = {keyword.arg: keyword.value for keyword in call.keywords}
-            default = given["default_value"]
-            if isinstance(default, ast.Call):  # of a file that is installed
-                default = default.args[0]
-            yield call.args[0].value, default.value, given["description"].value
+            yield call.args[0].value, given["default_value"].value, given["description"].value
 
 
 def test_the_readme_has_every_argument_with_its_default_and_meaning():
     _, _, below = (ROOT / "docs/ros.md").read_text().partition("| argument | default | |\n|---|---|---|\n")
     rows = [f"| `{name}` | {f'`{default}`' if default else ''} | {text} |" for name, default, text in arguments()]
     assert below.split("\n\n")[0].splitlines() == rows
-    assert len(rows) == 10
+    assert len(rows) == 13
 
 
 def test_the_executable_and_the_files_it_names_are_installed():
@@ -71,10 +70,10 @@ def prefix(tmp_path):
     """What colcon would install, as far as launch looks for it."""
     index = tmp_path / "share/ament_index/resource_index/packages"
     index.mkdir(parents=True)
-    for package in ("graph_slam_ros", "rviz2"):
-        (index / package).touch()
-    (tmp_path / "share/graph_slam_ros").mkdir()
-    (tmp_path / "share/graph_slam_ros/config").symlink_to(ROOT / "config")
+    for name in (NODE, RVIZ, TAGS):
+        (index / name.split("/")[0]).touch()
+    shutil.copytree(ROOT / "config", tmp_path / "share/graph_slam_ros/config")
+    shutil.copytree(PRESETS, tmp_path / "share/graph_slam_ros/config/presets")
     return tmp_path
 
 
@@ -114,7 +113,7 @@ def launched(prefix, *words):
 
 def started(prefix, *words):
     """Of each executable that was started, its words and what its parameter files say."""
-    told = {name: prefix / Path(name).name for name in (NODE, RVIZ)}
+    told = {name: prefix / Path(name).name for name in (NODE, RVIZ, TAGS)}
     for name, file in told.items():
         if not (prefix / "lib" / name).exists():
             install(prefix, name, TELL.format(told=str(file)))
@@ -145,6 +144,18 @@ def test_arguments_reach_the_node_and_rviz_and_without_any_the_node_has_the_ship
     assert words[words.index("-d") + 1].endswith("config/graph_slam.rviz")
     assert "__ns:=/robot1" in words
     assert "use_sim_time: true" in parameters
+
+
+@needs_launch
+def test_a_preset_is_below_a_file_of_ones_own_and_a_detector_is_started_where_images_are_named(prefix):
+    (prefix / "own.yaml").write_text("/**: {ros__parameters: {tags: {sigma_m: 0.5}}}")
+    out = started(prefix, "preset:=tags", f"params_file:={prefix}/own.yaml", "image:=/camera/image", "tag_size:=0.16")
+    assert out[NODE][1].startswith(
+        (PRESETS / "tags.yaml").read_text() + "/**: {ros__parameters: {tags: {sigma_m: 0.5}}}"
+    )
+    words, parameters = out[TAGS]
+    assert {"image_rect:=/camera/image", "camera_info:=/camera/camera_info"} <= set(words)
+    assert "size: 0.16" in parameters
 
 
 @needs_launch

@@ -29,6 +29,18 @@ def test_the_shipped_files_are_exactly_what_the_code_writes_of_its_defaults_or_s
     assert Config.from_mapping(read_parameters(CONFIG / "spatial.yaml")) == Config.from_mapping(IN_SPACE)
 
 
+def test_a_preset_is_found_by_its_name_where_no_file_has_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("tags", "poles", "gnss", "ranges", "closures"):
+        assert Config.from_mapping(read_parameters(name)).inputs.names.startswith("odom ")
+    (tmp_path / "tags").write_text("world: {dimensions: 3}")
+    assert Config.from_mapping(read_parameters("tags")) == Config.from_mapping(IN_SPACE)
+    with pytest.raises(
+        ConfigError, match="tag: No such file or directory; presets: closures, gnss, poles, ranges, tag"
+    ):
+        read_parameters("tag")
+
+
 def test_every_input_has_a_section_and_only_those():
     gps = {"type": "sensor_msgs/msg/NavSatFix", "sigma_m": 2}
     config = Config.from_mapping({"inputs.names": "odom gps", "gps": gps})
