@@ -166,7 +166,7 @@ class BoundedMap:
                 continue
             visit = ids[k:end].tolist()
             waits = limit - end < BATCH
-            ahead = self._seen_between(*ids[[end, begins[bisect_right(begins, end)] - 1]].tolist())
+            ahead = set[int]().union(*(some or () for some in marks[end : begins[bisect_right(begins, end)]]))
             done = self.condenser.condense(visit, int(ids[end]), cells[k], ahead, waits=waits)
             if done.how == "waits":
                 break
@@ -187,19 +187,6 @@ class BoundedMap:
             self._counters.count(_SOURCE, "not_condensed", keyframes)
         else:
             self._counters.count(_SOURCE, "visit_lost" if done.is_contradiction else "visit_condensed")
-
-    def _seen_between(self, first: int, last: int) -> set[int]:
-        """Return the landmarks that are seen from a keyframe and later ones up to another."""
-        graph, out = self._backend.graph, set[int]()
-        if "landmarks" not in graph.labels:
-            return out
-        code = graph.labels.index("landmarks")
-        for table in graph.tables.values():
-            ends = table.vertices
-            if ends.shape[1] > 1:
-                is_one = (table.label.values == code) & (table.weight.values > 0.0)
-                out.update(ends[is_one & (ends[:, 0] >= first) & (ends[:, 0] <= last), 1].tolist())
-        return out
 
     def _staying_keyframe(self, vertex: int) -> RemovedPose:
         """Return a keyframe that is its own base."""

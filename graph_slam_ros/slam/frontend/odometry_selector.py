@@ -54,6 +54,7 @@ class OdometrySelector:
     Attributes
     ----------
     sources : those that have been used
+    used : the last message that was used
     """
 
     def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Geometry, counters: Counters) -> None:
@@ -62,37 +63,32 @@ class OdometrySelector:
         self.sources: set[str] = set()
         self._order = list(priority)
         self._past: dict[str, deque[Odometry]] = {}
-        self._used: Odometry | None = None
+        self.used: Odometry | None = None
         self._last_step = space.identity
         self._usual_ns, self._longest_ns = 0.0, math.inf  # between two messages; more is a gap
 
     @property
-    def used(self) -> Odometry | None:
-        """The last odometry message that was used."""
-        return self._used
-
-    @property
     def newest_ns(self) -> int | None:
         """Stamp of the last odometry message that was used."""
-        return None if self._used is None else self._used.stamp_ns
+        return None if self.used is None else self.used.stamp_ns
 
     def forget(self) -> None:
         """Start over, for stamps of another time."""
         self._past.clear()
-        self._used = None
+        self.used = None
         self._last_step = self._space.identity
 
     @property
     def state(self) -> list[Any]:
         """Plain values, to ``go_on`` with."""
-        return [self._used and to_record(self._used), list(self._order), self._last_step, self._usual_ns]
+        return [self.used and to_record(self.used), list(self._order), self._last_step, self._usual_ns]
 
     def go_on(self, state: list[Any]) -> Odometry:
         """Continue after the odometry message that another one had used last, and return that."""
         used, order, last_step, usual_ns = state
         message = from_record(used)
         assert isinstance(message, Odometry)
-        self._used, self._order, self._last_step = message, list(order), tuple(last_step)
+        self.used, self._order, self._last_step = message, list(order), tuple(last_step)
         self._past[message.source] = deque([message], maxlen=_REMEMBERED)
         self._set_usual(usual_ns)
         return message
@@ -103,7 +99,7 @@ class OdometrySelector:
             self._order.append(m.source)
         if m.source not in self._past:
             self._past[m.source] = deque(maxlen=_REMEMBERED)
-        past, used = self._past[m.source], self._used
+        past, used = self._past[m.source], self.used
         if past and past[-1].stamp_ns == m.stamp_ns:
             self._counters.count(m.source, "duplicate" if past[-1] == m else "duplicate_stamp")
             return []
@@ -136,7 +132,7 @@ class OdometrySelector:
             return [self._use(newer[-1], self._space.identity, broken="jump")]
         self._counters.count(source, "switched_to")
         if not newer:  # of the very stamp that was used last
-            self._used = older[-1]
+            self.used = older[-1]
             return []
         a, b = older[-1], newer[0]
         fraction = (used.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
@@ -159,11 +155,11 @@ class OdometrySelector:
             self._counters.count(m.source, broken)
         self._counters.used[m.source] += 1
         self.sources.add(m.source)
-        dt_ns = m.stamp_ns - self._used.stamp_ns if self._used else 0
+        dt_ns = m.stamp_ns - self.used.stamp_ns if self.used else 0
         is_gap = dt_ns > self._longest_ns and not broken
         usual_ns = self._usual_ns or dt_ns
         self._set_usual(usual_ns + 0.1 * (min(dt_ns, 2.0 * usual_ns) - usual_ns))
-        self._used, self._last_step = m, self._space.identity if broken else step
+        self.used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken), is_gap)
 
     def _set_usual(self, usual_ns: float) -> None:
