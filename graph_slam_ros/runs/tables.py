@@ -20,8 +20,8 @@ from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, 
 from graph_slam_ros.runs.journal import CHANGES, LEDGER
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.slam import Counters, GraphSlam, MapView
-from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
+from graph_slam_ros.slam.levels import SIGMAS
 from graph_slam_ros.slam.lifelong.state import BoundedState, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import OUTSIDE, VerdictChange

@@ -12,6 +12,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded, run_when_asked
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
+from graph_slam_ros.slam.levels import GROWN
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise.factors import CLASSES, Key, NoiseScales
 from graph_slam_ros.slam.noise.scale import NoiseScale, estimate_noise, factors_of
@@ -31,7 +32,6 @@ from graph_slam_ros.typing import Array, Executor, Index, Numbers, Result
 if TYPE_CHECKING:
     from graph_slam_ros.slam.snapshot import MapSnapshot
 
-_MORE = 1.5  # times as many edges out as at the last search
 SECOND_LOOK, NOISE = "second_look", "noise_scale"  # of what is counted
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS = 8  # at most, of estimating the scale of the noise and solving with it
@@ -372,7 +372,7 @@ class Backend:
         after, out = self._config.second_look_after, self.ledger.outside_count
         self._out = min(self._out, out)
         is_on = self._config.decide and after > 0 and not self._background.is_busy
-        return is_on and out >= max(self._out + after, _MORE * self._out)
+        return is_on and out >= max(self._out + after, GROWN * self._out)
 
     def _search(self, settings: Settings) -> Work[Outcome | None]:
         frozen = self._frozen_graph(settings)

@@ -21,7 +21,8 @@ from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.lifelong.condenser import CHAIN, ENOUGH, Condensed, Condenser, RemovedPose, seen_from
+from graph_slam_ros.slam.levels import ENOUGH
+from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, seen_from
 from graph_slam_ros.slam.lifelong.place import Cell
 from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.robust.gating import CANDIDATES

@@ -11,11 +11,11 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.answers import SIGMAS, Fitted
+from graph_slam_ros.slam.calibration.answers import Fitted
 from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.levels import DIGITS
+from graph_slam_ros.slam.levels import DIGITS, SIGMAS
 from graph_slam_ros.slam.revision import Remeasured, Revision
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings

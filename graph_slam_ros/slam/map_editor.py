@@ -15,6 +15,7 @@ from graph_slam_ros.measurements.edits import AppliedEdit, Edit
 from graph_slam_ros.slam.anchor import TIGHT
 from graph_slam_ros.slam.edits import BY_HAND, HAND_MADE, anchors, determining, standing_edges, why_not_removed
 from graph_slam_ros.slam.landmarks.landmark import Landmark
+from graph_slam_ros.slam.levels import SINGULAR
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.hypotheses import moved_rigidly
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
@@ -25,7 +26,6 @@ from graph_slam_ros.typing import Array, Numbers
 
 _IF_CONDENSED = ("remove_edge", "let_in_edge", "add_closure", "rename_landmark")  # possible if visits are condensed
 _FOLLOWS = ("anchor", "initialpose", "range_offset")  # what is moved with the map, or does not say where it lies
-_SAME = 1e-6  # of chi2
 _AROUND_NS = 10**9  # a stamp may be so far outside the drive
 _WHY = {
     "unknown_edge": "it is not in the graph, or was taken out for good before",
@@ -307,7 +307,7 @@ class MapEditor:
         edges = np.setdiff1d(self._ledger.ids.since()[~np.isin(verdict, OUTSIDE)], list(moved))
         edges = edges[~graph.has_label(edges, _FOLLOWS)]
         before, after = (evaluated(graph, x, graph.edge_ids.existing(edges))[1] for x in (self.state.values, values))
-        rounding = _SAME * (1.0 + math.hypot(*T_new_old[: self._space.dimensions]))
+        rounding = SINGULAR * (1.0 + math.hypot(*T_new_old[: self._space.dimensions]))
         other = edges[np.abs(after - before) > rounding * np.maximum(1.0, before)].tolist()
         if other:
             raise GraphSlamError(

@@ -10,7 +10,8 @@ import numpy as np
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.typing import Array, Numbers
 
-_ALONG, _ACROSS = np.cos(np.radians(22.5)), np.sin(np.radians(22.5))
+_SECTOR = np.radians(22.5)
+_ALONG, _ACROSS = np.cos(_SECTOR), np.sin(_SECTOR)
 _ALIKE = 1.25  # between the largest and the smallest sigma: no direction is weaker than the others
 
 

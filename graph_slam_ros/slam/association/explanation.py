@@ -25,7 +25,6 @@ Ids = NDArray[np.int64]
 _LEAST_SLIP = 0.25  # of a slip, of how long it takes
 _HELD = 1e8  # information on the first pose
 _WEAK_PRIOR = 1e-6  # on a landmark
-_LOG_2_PI = float(np.log(2.0 * np.pi))
 _NEVER = 1e9  # the cost of a slip where none may be
 _DAMPED_AT_MOST = 1e6  # with more, a step moves nothing
 _MOST_WORK = 5_000_000  # rows that are linearised for moves: half a minute, ten times what 15 minutes of driving need
@@ -267,7 +266,7 @@ class Drive:
     def _volume(self, e: Estimate, loss_scale: float, *, slips: bool) -> float:
         normal, floor = self._normal(e, loss_scale or self.costs.loss_scale, slips=slips)
         try:
-            return normal.factor(floor).log_determinant - self.n * len(e.landmarks) * _LOG_2_PI
+            return normal.factor(floor).log_determinant - self.n * len(e.landmarks) * float(np.log(2.0 * np.pi))
         except np.linalg.LinAlgError:
             return np.inf  # not to be preferred
 

@@ -26,11 +26,12 @@ from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
+from graph_slam_ros.slam.levels import ROUNDING
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor
 
 _APART_NS = 100_000_000_000  # between scans that stand for the map: no stretch of the drive has two of them
-_LEAST_M2, _STILL = 1e-6, 1e-9  # variances of their landmarks, and of the motion between them
+_LEAST_M2 = 1e-6  # variance of their landmarks
 _FIRST, _MORE = 100, 2.0  # scans at the first time; then times as many
 _AMBIGUITY_CHI2 = 6.0  # by which every alternative is worse where a stretch is laid on others: likelier by e^3
 _GATE_OTHER = 0.99999  # an observation outside this probability of every landmark is not used
@@ -97,7 +98,7 @@ class FrozenScans:
             Cluster(point, count * (covariance + _LEAST_M2 * np.eye(n)), (), mark.sort)
             for mark, point, covariance in zip(marks, points, covariances, strict=True)
         )
-        still = Motion(np.zeros(n), np.zeros(dof - n), _STILL * np.eye(dof), 1e-3, is_broken=False)
+        still = Motion(np.zeros(n), np.zeros(dof - n), ROUNDING * np.eye(dof), 1e-3, is_broken=False)
         stamps_ns = [first.at.stamp_ns - k * _APART_NS for k in range(count, 0, -1)]
         before = np.array([mark.sightings - len(mark.seen) for mark in marks])
         return replace(

@@ -16,6 +16,7 @@ from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate,
 from graph_slam_ros.slam.association.moves import TRIAL, merged, reassigned, sorts_of, without_few
 from graph_slam_ros.slam.association.scans import FIT_M, are_others
 from graph_slam_ros.slam.landmarks.rotations import yaw
+from graph_slam_ros.slam.levels import ENOUGH
 from graph_slam_ros.typing import Array, Mask
 
 _SHORT_S, _WEAK = 100.0, 0.15  # a landmark that is seen for less, or in so small a part of the median's scans
@@ -25,7 +26,7 @@ _TRIES = 4  # candidates that are solved completely
 _OTHER = 0.1  # part of the clusters by which two candidates differ
 _MOST_COST, _MOST_PRIOR, _NONE = 14.0, 30.0, 60.0  # of a cluster, of a motion; chi2 of a cluster of no landmark
 _TURN_RAD, _MOVE_M = 0.3, 0.6  # sigmas of what odometry errs by in a gap
-_LEAST_CLUSTERS, _LEAST_STRONG = 3, 5  # of a stretch; scans of a landmark that it is laid on
+_LEAST_STRONG = 5  # scans of a landmark that a stretch is laid on
 _MOST_MOVES, _MOST_STRETCHES = 40, 16  # bound the time, as the next two
 _MOST_LOCAL, _MOST_SCORED = 8, 200  # landmarks whose pairs make motions, and motions that are compared by all clusters
 _HOPELESS = _NONE  # that much more than before is never mended by giving clusters to others
@@ -96,7 +97,7 @@ def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Es
     was_seen = np.isin(np.arange(len(outside)), e.which[drive.scan < first])
     strong = np.flatnonzero((outside >= least) & was_seen & (np.arange(len(outside)) != landmark))
     inside = np.flatnonzero(is_inside)
-    if len(strong) < 2 or len(inside) < _LEAST_CLUSTERS:
+    if len(strong) < 2 or len(inside) < ENOUGH:
         return None
     scans, found, done = slice(first, last + 1), list[Estimate](), [e.which[inside]]
     for which, turn, move in _candidates(drive, e, inside, strong, (first + last) // 2):

@@ -35,13 +35,12 @@ import numpy as np
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import BEND, DEGREE, OF_ODOMETRY, Parameter, Values
 from graph_slam_ros.slam.frontend.corrections import AXES
+from graph_slam_ros.slam.levels import ENOUGH, SIGMAS
 from graph_slam_ros.typing import Array
 
-SIGMAS = 4.0  # 1 in 16,000 by chance, for each parameter
 MOST_CORRELATED = 0.95  # with more, noise decides which of two it is
 PRIOR_SIGMAS = 3.0  # more is another configuration, not an error of this one
 MOST_LOST = 0.2  # part of the sightings: with more, the fit is of what is left
-LEAST_LANDMARKS = 3  # two tell a pose, a third that it is right
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
 LEAST_SIGMA_PER_M = 1e-3  # of odometry: the noise of its position [m] for each metre
 _OF_MOTION = {"yaw": 0, "pitch": 1}  # angles that are measured against the motion, and the direction across it
@@ -133,8 +132,8 @@ def is_certain(found: TrialFit, parameter: Parameter) -> bool:
 
 def _void(found: TrialFit, landmarks: int, sigma_per_m: float) -> str:
     """Return why a whole fit is not used; empty if it may be."""
-    if landmarks < LEAST_LANDMARKS:
-        return f"{landmarks} landmark{' was' if landmarks == 1 else 's were'} seen, {LEAST_LANDMARKS} are needed"
+    if landmarks < ENOUGH:
+        return f"{landmarks} landmark{' was' if landmarks == 1 else 's were'} seen, {ENOUGH} are needed"
     if why := unsure(found):
         return f"{why[0]}: check ids and noise, or configure it"
     if sigma_per_m < LEAST_SIGMA_PER_M:

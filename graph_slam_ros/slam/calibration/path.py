@@ -12,10 +12,10 @@ import numpy as np
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.corrections import scaled
 from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
+from graph_slam_ros.slam.levels import ROUNDING
 from graph_slam_ros.typing import Array, Index, Mask
 
 _AROUND_S = 0.25  # to either side of a stamp: shorter, and a velocity is noise
-_LEAST_S = 1e-9  # of an interval: two keyframes may have one stamp
 _REST_S = 3.0  # between two samples of odometry: longer, and nobody knows when of it the robot moved
 
 
@@ -86,4 +86,4 @@ class EstimatedPath:
 def _interval(seconds: Any, at_s: Any) -> tuple[Index, Array]:
     """The interval (n,) that each time is in, and the part of it that is over."""
     k = np.clip(np.searchsorted(seconds, at_s, side="right") - 1, 0, len(seconds) - 2)
-    return k, np.clip((at_s - seconds[k]) / np.maximum(seconds[k + 1] - seconds[k], _LEAST_S), 0.0, 1.0)
+    return k, np.clip((at_s - seconds[k]) / np.maximum(seconds[k + 1] - seconds[k], ROUNDING), 0.0, 1.0)

@@ -15,10 +15,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.slam.calibration.answers import LEAST_M, SIGMAS, is_certain
+from graph_slam_ros.slam.calibration.answers import LEAST_M, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit
 from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.levels import SIGMAS
 
 _SIGMA_M = 0.5  # of a place on a robot of a metre, beforehand
 _AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so much of it, whatever its noise is of

@@ -45,7 +45,7 @@ from graph_slam_ros.slam.doubt.record import (
 )
 from graph_slam_ros.slam.doubt.window import View, Window
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.levels import SAME_M, SAME_RAD
+from graph_slam_ros.slam.levels import ENOUGH, SAME_M, SAME_RAD
 from graph_slam_ros.slam.revision import Replacement, Revision
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -64,7 +64,7 @@ _OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
 _ALARM = 4  # sightings more for another pose than for odometry's
 _ALARM_FROM = 2  # landmarks, and keyframes: one landmark that moved, or one bad image, is no alarm
 _DECIDED = 10  # sightings more, and twice those for a third pose
-_DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tell as much as three without
+_DECIDED_KEYFRAMES = 4  # and enough landmarks: two with headings tell as much as three without
 _TRIED = 5  # sightings that are compared with odometry's noise
 _MOST = 0.8  # part of the sightings since then that fit the other pose
 _DRIFT = 3.0  # sigmas of odometry since a displacement
@@ -276,7 +276,7 @@ class OdometryDoubt:
         return (
             found.evidence >= max(_DECIDED, 2 * found.rival)
             and len(found.fitting) >= _MOST * (len(found.fitting) + len(found.contradicting))
-            and found.landmarks + found.has_headings >= _DECIDED_LANDMARKS
+            and found.landmarks + found.has_headings >= ENOUGH
             and found.keyframes >= _DECIDED_KEYFRAMES
         )
 

@@ -20,14 +20,13 @@ from graph_slam_ros.slam.doubt.connections import Connections, connections_acros
 from graph_slam_ros.slam.doubt.record import DisplacementHypothesis, Link
 from graph_slam_ros.slam.doubt.window import REACH_S, Seen, View, Window
 from graph_slam_ros.slam.landmarks.rotations import aligned, are_spread, pose_of
-from graph_slam_ros.slam.levels import SAME_M, SAME_RAD
+from graph_slam_ros.slam.levels import LIKELY, SAME_M, SAME_RAD
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Flags = NDArray[np.bool_]
 
 _SIGHTINGS = 50  # that are compared
 _SEEDS = 10  # newest held back sightings from which another pose is computed
-_FIT = 0.999  # probability with which a true sighting fits the other pose
 _MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
 _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
@@ -152,7 +151,7 @@ class DisplacementSearch:
         group = self._space.group
         now = tuple(self._solver.estimate([link.vertices[1]])[0].tolist())
         point = group.act(group.compose(now, group.inverse(link.pose)), tuple(np.array(one.point).tolist()))
-        allowed = quantile(_FIT, self._space.dimensions) * (one.variance + _MAP_SIGMA_M**2)
+        allowed = quantile(LIKELY, self._space.dimensions) * (one.variance + _MAP_SIGMA_M**2)
         return bool(np.sum((np.array(point) - place) ** 2) <= allowed)
 
     def _motions(self, window: _Sightings) -> Iterator[tuple[tuple[Array, Array], int]]:
@@ -193,13 +192,13 @@ class DisplacementSearch:
         """Sightings that fit a motion; one that would fit nearly anywhere does not count."""
         turn, shift = motion
         away = np.sum((window.points @ turn.T + shift - window.places) ** 2, axis=1)
-        allowed = quantile(_FIT, self._space.dimensions) * self._variances(window, at)
+        allowed = quantile(LIKELY, self._space.dimensions) * self._variances(window, at)
         is_informative = allowed <= (_VAGUE_M + _VAGUE * self._levers(window)) ** 2
         fits = (away <= allowed) & is_informative & (window.seconds > -REACH_S)
         off = se2.wrap(window.headings + np.arctan2(turn[1, 0], turn[0, 0]) - window.place_headings)
         drift = np.abs(window.drifts - window.drifts[at])[:, 1]
         spread = window.heading_variances + drift + _HEADING_SIGMA_RAD**2
-        return np.asarray(fits & ~(off**2 > quantile(_FIT, 1) * spread))
+        return np.asarray(fits & ~(off**2 > quantile(LIKELY, 1) * spread))
 
     def _evidence(
         self, window: _Sightings, fits: Flags, motion: tuple[Array, Array], earlier: Connections | None

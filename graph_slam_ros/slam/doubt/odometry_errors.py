@@ -12,12 +12,12 @@ import numpy as np
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.doubt.evidence import UNKNOWN, covariance_of
+from graph_slam_ros.slam.levels import SINGULAR
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
 
 _OBSERVED = 0.95  # largest eigenvalue of a direction that other measurements observe
-_LEAST = 1e-6  # an eigenvalue below is rounding
 
 
 class OdometryErrors:
@@ -43,7 +43,7 @@ class OdometryErrors:
         whitened = white @ jacobian
         eigenvalues, directions = np.linalg.eigh(whitened @ joint @ whitened.T)
         observed = eigenvalues < _OBSERVED
-        left = np.maximum(eigenvalues[observed], _LEAST)
+        left = np.maximum(eigenvalues[observed], SINGULAR)
         self._axes = directions[:, observed].T @ white  # from errors of the edges to what is observed
         self._errors, self._variances = self._axes @ residual / (1.0 - left), left / (1.0 - left)
         self._dof = dof

@@ -22,18 +22,17 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.evidence import covariance_of
 from graph_slam_ros.slam.doubt.record import Link
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.levels import BY_CHANCE, GATE
+from graph_slam_ros.slam.levels import BY_CHANCE, GATE, LIKELY, TYPICAL
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 _KEYFRAMES = 2000  # whose odometry is kept
 _VIEWS = 50  # that are kept
 _SURE = 1.0 - BY_CHANCE  # probability with which clean measurements raise no alarm
 _SUMS = (1, 2, 4, 8, 16)  # views whose innovations are summed
-_USUAL, _FEWEST = 200, 30  # newest sightings whose median says how large residuals are, and how many that needs
+_USUAL = 200  # newest sightings whose median says how large residuals are
 _NEWEST, _LEAST = 20, 6  # sightings that are compared for the other alarm
 _PER_LANDMARK = 4  # of them, at most
 REACH_S = 20.0  # sightings that are older are not compared with the newest
-_RATE_SURE = 0.999  # the rate of wrong ones is at most what it may be with this probability, by what was seen
 _CALM, _CALM_SURE = 12, 0.99  # newest sightings of which three quarters must agree for an alarm to end
 _SUPPORT, _FIRST = 4, 20  # accepted sightings, of the first so many, that make a landmark one to compare with
 _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
@@ -239,7 +238,7 @@ class Window:
 
     def _usual(self) -> float:
         """Return how large squared residuals at predicted poses are, in units of the stated noise's; at least 1."""
-        return max(1.0, median(self._ratios)) if len(self._ratios) >= _FEWEST else 1.0
+        return max(1.0, median(self._ratios)) if len(self._ratios) >= TYPICAL else 1.0
 
     @property
     def is_alarmed(self) -> bool:
@@ -298,5 +297,5 @@ class Window:
 @lru_cache(maxsize=64)
 def _wrong_by_chance(count: int, held_back: int, seen: int) -> int:
     """The most of a count that are wrong, at the rate by which some of those seen were held back."""
-    rate = betaincinv(1 + held_back, 1 + seen - held_back, _RATE_SURE)
+    rate = betaincinv(1 + held_back, 1 + seen - held_back, LIKELY)
     return next((k for k in range(count) if bdtr(k, count, rate) >= _SURE), count)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
 from graph_slam_ros.measurements.types import Closure, Fix, Sighting, Sightings
+from graph_slam_ros.slam import levels
 from graph_slam_ros.typing import Array, Numbers
 
 ROUNDING = 100.0 * float(np.finfo(float).eps)  # of the largest variance that was added up to a covariance
-_NEAREST_M = 1e-9  # below this distance a direction is rounding
 _STEEP = 0.2  # cosine of an elevation: at 78.5 degrees and above the azimuth is turned away from the pole
 _UNKNOWN_M2 = 1e6  # a variance of this or more says that an axis was not measured
 
@@ -138,8 +138,8 @@ def as_matrix(flat: Numbers) -> Array:
 
 def gradient(space: Geometry, kind: str, p: Array) -> Array:
     """Return the derivative (..., m, n) of range, bearing or both at points p (..., n) in the sensor's frame."""
-    flat = np.maximum(np.hypot(p[..., 0], p[..., 1]), _NEAREST_M)
-    far = np.maximum(np.linalg.norm(p, axis=-1), _NEAREST_M)
+    flat = np.maximum(np.hypot(p[..., 0], p[..., 1]), levels.ROUNDING)
+    far = np.maximum(np.linalg.norm(p, axis=-1), levels.ROUNDING)
     rows = []
     if kind in ("range", "range_bearing"):
         rows.append(p / far[..., None])

@@ -10,10 +10,10 @@ from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Odometry, from_record, to_record
+from graph_slam_ros.slam.levels import ROUNDING
 from graph_slam_ros.typing import Numbers
 
 JUMP_SIGMA_M, JUMP_SIGMA_RAD = 10.0, 3.0  # of the motion across a jump: any heading, and anywhere within a hall
-_AT_ZERO = 1e-9  # [m, rad]
 _RESET, UNUSUAL = 0.1, 3.0  # m, rad; times the motion before: odometry does not go on from there
 _LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed
 _GAP, _LEAST_GAP_NS = 10.0, 2_000_000_000  # times the usual period, at least; recorded robots pause for 1.4 s
@@ -182,13 +182,13 @@ class OdometrySelector:
 
     def _is_reset(self, motion: Numbers, T_odom_base: Numbers, *, is_gap: bool) -> bool:
         """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step."""
-        if abs(T_odom_base[0]) > _AT_ZERO and not is_gap:
+        if abs(T_odom_base[0]) > ROUNDING and not is_gap:
             return False
         (far_m, far_rad), (at_m, at_rad), (usual_m, usual_rad) = map(self._size, (motion, T_odom_base, self._last_step))
         most_m, most_rad = max(_RESET, UNUSUAL * usual_m), max(_RESET, UNUSUAL * usual_rad)
-        is_at_zero = at_m <= most_m and at_rad <= most_rad if is_gap else max(at_m, at_rad) <= _AT_ZERO
+        is_at_zero = at_m <= most_m and at_rad <= most_rad if is_gap else max(at_m, at_rad) <= ROUNDING
         is_far = far_m > most_m  # a heading may be that of a compass, which goes on
-        return (is_at_zero and (is_far or far_rad > most_rad)) or (at_m <= _AT_ZERO and is_far)
+        return (is_at_zero and (is_far or far_rad > most_rad)) or (at_m <= ROUNDING and is_far)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:
         return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from graph_slam_ros.slam.levels import SIGMAS
 from graph_slam_ros.typing import Array, Index
 
 LEAST = 4  # sightings of an id that counts, and ids on either side
 _SPANNING = 0.1  # part of the ids of either side that may be seen on both: wrong ones
 _SAME, _NEAR_M = 0.5, 1.0  # part of the new ids that lie where others were, so near, in spacings; at most
-_BY_CHANCE, _SIGMAS = 0.16, 4.0  # part of them that is so near to another by chance, in landmarks that lie at random
+_BY_CHANCE = 0.16  # part of them that is so near to another by chance, in landmarks that lie at random
 _NEXT = 5  # ids that are new after one, of which the nearest is how far apart landmarks are
 
 
@@ -56,7 +57,7 @@ def renewed_ids(names: Sequence[str], at: Array, first_ns: Index, last_ns: Index
     new = len(first_ns) - np.searchsorted(np.sort(first_ns), since_ns)
     again = ends_ns < first_ns
     same = np.searchsorted(np.sort(ends_ns[again]), since_ns) - np.searchsorted(np.sort(first_ns[again]), since_ns)
-    least = np.maximum(_SAME * new, _BY_CHANCE * new + _SIGMAS * np.sqrt(_BY_CHANCE * (1.0 - _BY_CHANCE) * new))
+    least = np.maximum(_SAME * new, _BY_CHANCE * new + SIGMAS * np.sqrt(_BY_CHANCE * (1.0 - _BY_CHANCE) * new))
     spanning = len(first_ns) - before - new
     is_renewed = (same >= np.maximum(least, LEAST)) & (spanning <= _SPANNING * np.minimum(before, new))
     if not is_renewed.any():

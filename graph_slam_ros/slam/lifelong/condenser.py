@@ -11,7 +11,7 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.slam.levels import GATE
+from graph_slam_ros.slam.levels import ENOUGH, GATE
 from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
 from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, added_place, fit_of
 from graph_slam_ros.slam.lifelong.state import BoundedState
@@ -24,7 +24,6 @@ CHAIN = "composed"  # label of edges that are composed of odometry
 ITSELF, PLACE = "it contradicts itself", "it contradicts its place"
 """Why the sightings of a visit are lost."""
 _MOST_MEMBERS, _MOST_PLACES = 48, 8  # landmarks of one place; places of one cell
-ENOUGH = 3  # landmarks of a visit, and of the keyframes after it before odometry is cut; ranges of what is left out
 
 
 @dataclass(frozen=True, slots=True)

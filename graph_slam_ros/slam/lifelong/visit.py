@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry, rigid_motions
+from graph_slam_ros.slam.levels import SINGULAR
 from graph_slam_ros.slam.lifelong.constellation import Constellation
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, product
 from graph_slam_ros.slam.lifelong.place import Place
@@ -18,7 +19,6 @@ from graph_slam_ros.typing import Array
 
 _SETTINGS = replace(Settings(), step_tolerance=1e-10, cost_tolerance=0.0)
 _ONE_STEP = replace(Settings(), max_iterations=1, cost_tolerance=np.inf)
-_LEAST = 1e-6  # eigenvalue of the correlations of a landmark, given the poses: with less it is not determined
 Estimate = Callable[[ArrayLike], Array]
 
 
@@ -109,7 +109,7 @@ def best_known(
 def _is_sure(information: Array) -> bool:
     """Return whether the information of a landmark, given the poses, is of full rank."""
     scale = np.sqrt(np.diag(information))
-    return bool(scale.all()) and float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0]) > _LEAST
+    return bool(scale.all()) and float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0]) > SINGULAR
 
 
 def _marks(space: Geometry, graph: Graph, ends: Iterable[Sequence[int]], poses: Sequence[int]) -> list[int]:

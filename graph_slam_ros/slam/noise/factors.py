@@ -11,12 +11,12 @@ import numpy as np
 
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.slam.levels import ROUNDING
 from graph_slam_ros.typing import Array, Index
 
 CLASSES = ("odometry", "landmarks", "fixes", "closures")
 FIRST_DUE = 50  # keyframes
 LEAST_CHANGE = 0.02  # of a sigma: less changes nothing
-_LEAST_OWN = 1e-9  # part of a variance that is not of the motion: less is rounding
 
 PER_RAD, PER_M = " per rad", " per m"
 
@@ -50,7 +50,7 @@ def grown_with(variance: Array, measured: Array, now: Array) -> Array:
     now : (3,) the components that the variance has
     """
     sizes = np.stack(motion_sizes(measured), axis=1)
-    own = np.maximum(variance - sizes @ now[1:], _LEAST_OWN * variance) / now[0]
+    own = np.maximum(variance - sizes @ now[1:], ROUNDING * variance) / now[0]
     return np.column_stack((own, sizes))
 
 

@@ -32,7 +32,7 @@ from scipy.optimize import nnls
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.slam.levels import PRIOR_DOF
+from graph_slam_ros.slam.levels import PRIOR_DOF, SINGULAR
 from graph_slam_ros.slam.noise.factors import (
     CLASSES,
     PER_M,
@@ -57,7 +57,6 @@ LEAST_DOF_OF_MOTION = PRIOR_DOF  # of odometry, whose estimate changes the less 
 MOST_OUTLIERS = 0.05  # part of a group: with more, its residuals are not those of noise
 LEAST_WEIGHT = 0.1  # by the loss: an edge with less is an outlier
 SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma; an error that is larger, squared, counts as its variance
-_ROUNDING = 1e-6  # degrees of freedom, less of which are rounding: another processor has none
 _MOST_WINDOWS = 100  # the same of windows
 _MOST_SAMPLED = 200  # edges of a group whose leverage is computed: their joint covariances cost most of all
 CONFIGURED_COUNT = 50.0  # steps of odometry: its configured noise counts as that of so many
@@ -345,7 +344,7 @@ def _passes(ends: Index, stamp_of: Index) -> list[Index]:
 
 def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
     dof = max(total.residuals - total.leverage, 0.0)
-    per_dof = total.chi2 / dof if dof > _ROUNDING else float("nan")
+    per_dof = total.chi2 / dof if dof > SINGULAR else float("nan")
     design_effect = 1.0
     if total.passes >= LEAST_PASSES and total.of_singles > 0.0:
         design_effect = max(1.0, total.of_means / total.of_singles)

@@ -22,6 +22,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.slam.levels import ENOUGH, GROWN, TYPICAL
 from graph_slam_ros.slam.robust.innovation import innovations, likely_together
 from graph_slam_ros.slam.robust.landmark_support import is_determined, is_needed, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, OUTSIDE, Ledger, Reason, Verdict
@@ -30,16 +31,13 @@ from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
-_AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
 _RETESTS = 10  # of them at once, and at each review: ten innovations cost less than an update
 _OUT_BELOW = 0.01  # of its weight: what counts for less moves nothing, and is removed
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
-_TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
 _TIGHTEST = 1.0 / _SLACK  # part of a gate that is left
 _REDUNDANT = 0.05  # of a measurement, that others say too: below, its residual says nothing of its noise
-_GROWN = 1.5  # times as many edges: their redundancy is computed again
 
 
 class OutlierGate:
@@ -208,7 +206,7 @@ class OutlierGate:
         """
         nearest = self._nearest(_RETESTS)
         costs = dict(zip(nearest, self.innovations(nearest), strict=True))
-        group = likely_together(self._graph, self._solver, self._affordable(costs), self.most_cost, _AGREEING)
+        group = likely_together(self._graph, self._solver, self._affordable(costs), self.most_cost, ENOUGH)
         for edge in group:
             self._readmit(edge, keyframe, costs[edge])
         return group
@@ -447,7 +445,7 @@ class OutlierGate:
             of_label = self._graph.has_label(inside, (label,))
             self._tightness.update(label, inside[of_label], chi2[of_label], numbers[of_label])
         freedom = self._solver.degrees_of_freedom
-        self.is_calibrated = freedom >= _TYPICAL
+        self.is_calibrated = freedom >= TYPICAL
         if self.is_calibrated:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
@@ -473,7 +471,7 @@ class Tightness:
 
     def update(self, label: str, edges: Index, chi2: Array, numbers: Index) -> None:
         """Compare the residuals of a class's accepted edges with their noise. False ones do not change a median."""
-        if len(edges) < _TYPICAL:
+        if len(edges) < TYPICAL:
             return
         ratio = _SLACK * float(np.median(chi2 / np.array([_median(n) for n in numbers.tolist()])))
         if ratio < 1.0:
@@ -484,8 +482,8 @@ class Tightness:
     def _redundancy_of(self, label: str, edges: Index) -> float:
         """Return the median redundancy of a class, by some of its edges, from 0 to 1; of old ones while it grows."""
         count, known = self._redundancy.get(label, (0, 0.0))
-        if len(edges) >= _GROWN * count:
-            some = np.linspace(0, len(edges) - 1, _TYPICAL).astype(int)
+        if len(edges) >= GROWN * count:
+            some = np.linspace(0, len(edges) - 1, TYPICAL).astype(int)
             try:
                 found = [self._left_of(*of_table) for of_table in self._graph.by_table(edges[some]).items()]
             except (GraphSlamError, np.linalg.LinAlgError):
