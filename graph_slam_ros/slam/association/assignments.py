@@ -17,11 +17,12 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.noise.scale import ALIKE_NS
 
 NOT_IN_MAP = ""  # in place of a name, where the map is held and nothing in it fits
 NAME = "unnamed"
 """What landmarks are called that have no name; a number follows."""
-_CONFIRMED, _CONFIRMED_NS = 5, 2 * 10**9  # sightings, and their time: clutter is seen for less, from one place
+_CONFIRMED = 5  # sightings, which last longer than alike errors: clutter is seen for less, from one place
 _OF_MEDIAN = 0.1  # part of the scans of the median landmark that one is seen in to be believed
 _GIVE_UP_NS = 60 * 10**9  # a landmark that is not confirmed goes when it was not seen for this long
 _FROM_MAP = -100  # numbers of landmarks that no cluster of this drive began, downwards
@@ -175,7 +176,7 @@ class Assignments:
             mark = known.get(name)
             if mark is None or self._landmarks.is_held(name):
                 continue
-            for_long = mark.last_seen_ns - mark.first_seen_ns >= _CONFIRMED_NS
+            for_long = mark.last_seen_ns - mark.first_seen_ns >= ALIKE_NS
             often = number < _FROM_MAP or self._scans[number] >= least
             is_sure = mark.sightings >= _CONFIRMED and for_long and often
             is_sure |= len(mark.seen) < mark.sightings and not mark.is_tentative  # some cannot be taken back any more

@@ -22,12 +22,14 @@ from graph_slam_ros.typing import Array, Index
 
 _VIEW = 12  # scans before it was moved, which show the field of view, and what the sensor misses
 _AFTER, _NEW = 3, 6  # scans since what was followed is lost, and at least so many clusters in them
-_NEWEST, _CLUSTERS = 6, 8  # scans that are compared with the map around them, and at least so many clusters in them
-_GOES_ON, _FOUND = 0.25, 0.5  # part of the clusters that is of landmarks seen before: at most, and once it is found
+_COMPARED = (6, 9, 12, 18, 24)  # newest scans that are compared with the whole map
+_NEWEST = _COMPARED[0]  # scans that are compared with the map around them
+_CLUSTERS = 8  # in them, at least
+_FOUND = 0.5  # part of the clusters that is of landmarks seen before, once it is found
+_GOES_ON = 0.5 * _FOUND  # at most, while it is lost
 _MISSING, _MISSING_LANDMARKS = 4, 2  # landmarks that should be seen and are not, over the scans, and different ones
 _MISSED_BY_CHANCE = 1e-5  # probability
 _SLIP = 0.5  # part of the way by which odometry may err: that is a slip
-_COMPARED = (6, 9, 12, 18, 24)  # newest scans that are compared with the whole map
 _MOST_GROUPS = 12  # newest landmarks that are compared: bounds the time
 
 

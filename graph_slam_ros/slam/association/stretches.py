@@ -21,11 +21,10 @@ from graph_slam_ros.typing import Array, Mask
 
 _SHORT_S, _WEAK = 100.0, 0.15  # a landmark that is seen for less, or in so small a part of the median's scans
 _GAP_S, _LONGEST_S = 5.0, 60.0  # without a scan, in which odometry may err unseen; of a stretch around a landmark
-_SAME_M, _LEAST_M = 0.6, 0.5  # between distances of two pairs of landmarks that may be one; of a pair
 _TRIES = 4  # candidates that are solved completely
 _OTHER = 0.1  # part of the clusters by which two candidates differ
 _MOST_COST, _MOST_PRIOR, _NONE = 14.0, 30.0, 60.0  # of a cluster, of a motion; chi2 of a cluster of no landmark
-_TURN_RAD, _MOVE_M = 0.3, 0.6  # sigmas of what odometry errs by in a gap
+_TURN_RAD, _MOVE_M = 0.3, 0.6  # sigmas of what odometry errs by in a gap; and so do distances of pairs of landmarks
 _LEAST_STRONG = 5  # scans of a landmark that a stretch is laid on
 _MOST_MOVES, _MOST_STRETCHES = 40, 16  # bound the time, as the next two
 _MOST_LOCAL, _MOST_SCORED = 8, 200  # landmarks whose pairs make motions, and motions that are compared by all clusters
@@ -201,5 +200,5 @@ def _motions(local: Array, there: Array, centre: Array) -> Motions:
         turn = yaw(bearing - np.arctan2(*(one - centre)[1::-1]), n)
         turns += [turn, np.broadcast_to(np.eye(n), turn.shape)]
         moves += [centre - turn @ centre, there - one]
-    by_pairs = pair_motions(local, there, _LEAST_M, _SAME_M)
+    by_pairs = pair_motions(local, there, FIT_M, _MOVE_M)
     return np.concatenate([*turns, by_pairs[0]]), np.concatenate([*moves, by_pairs[1]])
