@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.analysis.consistency import Consistency
+from graph_slam_ros.analysis.consistency import Consistency, consistency_of
 from graph_slam_ros.analysis.path_error import (
     STATISTICS,
     Drift,
@@ -23,7 +23,6 @@ from graph_slam_ros.analysis.path_error import (
     matched,
     path_error,
 )
-from graph_slam_ros.analysis.run_consistency import consistency_of
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import is_empty

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
-from graph_slam_ros.graph import EdgeType, Gaussian, Graph, Loss
+from graph_slam_ros.graph import Gaussian, Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import RunError
@@ -288,10 +288,6 @@ class SavedGraph:
     def whole_path(self) -> WholePath:
         """All keyframes, those that were condensed included."""
         return WholePath.of(self.view, self.folder)
-
-    def type_of(self, entry: Entry) -> EdgeType:
-        """The type of an edge."""
-        return self.graph.edge(entry.edge).type
 
     def landmark_of(self, vertex: int) -> str:
         """The name of the landmark of a vertex; empty if it is not a landmark."""

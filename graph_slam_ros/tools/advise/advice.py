@@ -169,7 +169,7 @@ class Additions:
         types = {*space.sightings.values(), space.tag_position}
         for entry in self._run.entries:
             is_known = entry.is_in and entry.landmark in self._run.landmarks
-            key = entry.source, self._run.type_of(entry)
+            key = entry.source, self._run.graph.edge(entry.edge).type
             if is_known and key[1] in types and self._run.keyframe(entry.vertices[0]) is not None:
                 of_key.setdefault(key, []).append(entry)
                 self._of_landmark.setdefault(entry.landmark, Counter())[key] += 1
