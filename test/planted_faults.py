@@ -183,7 +183,7 @@ FAULTS = {
     "sightings given in odom": (of("wrong_frames:landmarks=odom"), "seen_in_fixed_frame"),
     "twist sigma 1e-6": (of("twist_variance:variance=1e-12"), "covariance_tiny"),
     "twist variance 1000": (of("twist_variance:variance=1000.0"), "covariance_useless"),
-    "negative variance": (of("twist_variance:variance=-1.0"), "covariance_negative"),
+    "negative variance": (of("twist_variance:variance=-1.0"), "covariance_not_positive_definite"),
     "noise 8 times its covariance": (of("noisy"), "over_confident"),
     "two landmarks share an identity": (reused, "id_reused"),
     "two identities exchanged half-way": (exchanged, "ids_exchanged"),

@@ -15,19 +15,18 @@ from graph_slam_ros.check.times import check_times, rounded_s
 from graph_slam_ros.findings.finding import Finding, Severity, in_order
 from graph_slam_ros.findings.table import Effect, explain
 
-_MOST = 0.5
+_MOST = 0.5  # part of the messages: with more refused, a replay means nothing
 _USUAL = {  # of single messages: detectors err, and a recording begins and ends somewhere
     *("zero_stamp", "no_id", "late", "before_odometry", "after_odometry", "overhead", "beyond_max_distance"),
     *("no_fix", "no_result", "other_publisher", "future", "far_in_time", "id_conflict", "poor_tag"),
     *("duplicate_stamp", "undecodable", "transform_gaps"),
 }
-_USUAL_SHARE = 0.05
+_USUAL_SHARE = 0.05  # of the messages
 _JOINT = ("landmarks.association=joint",)
 # those that a check of its own explains better
 ELSEWHERE = {"frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"}
-_BAD_COVARIANCE = ("covariance_not_positive_definite", "nonfinite_covariance")
 _OF_ROUNDED = ("other_publisher", "duplicate_stamp")  # of odometry whose stamps are rounded
-_OF_COVARIANCE = {*_BAD_COVARIANCE, "covariance_asymmetric"}
+_OF_COVARIANCE = ("covariance_not_positive_definite", "nonfinite_covariance", "covariance_asymmetric")
 Check = Callable[[Columns], Iterator[Finding]]
 
 
@@ -38,16 +37,18 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
         topic = c.topic_of(source)
         for reason, times in counts.items():
             row = explain(reason)
-            is_told = reason in _BAD_COVARIANCE or (reason in _OF_ROUNDED and rounded_s(c.odometry) > 0.0)
+            is_odometry = source == c.odometry.input
+            is_told = is_odometry and reason in _OF_ROUNDED and rounded_s(c.odometry) > 0.0
             is_lost = row.effect is Effect.REFUSED and reason not in ELSEWHERE
-            if not (is_lost or reason == "mount_unknown") or (source == c.odometry.input and is_told):
+            if not (is_lost or reason == "mount_unknown") or is_told:
                 continue
             received = max(c.counters.received[source], items.get(source, 0) + times, times)
             share = times / received
             limit = _USUAL_SHARE if reason in _USUAL else 0.0
             severity: Severity = "error" if share > _MOST and is_lost else "warning" if share > limit else "note"
             text = f"{source}: {times} of {received}{' are refused' * is_lost}: {row.meaning}"
-            settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and source in items else ()
+            stated = "odometry.noise=density" if is_odometry else f"{source}.noise=sigmas"
+            settings = (stated,) if reason in _OF_COVARIANCE and (is_odometry or source in items) else ()
             name, first_ns = (source, 0) if topic is None else (topic.topic, int(next(iter(topic.stamp_ns), 0)))
             yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times, settings, source)
 

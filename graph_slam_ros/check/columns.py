@@ -22,12 +22,11 @@ from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.detections import names_of
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount, pose
-from graph_slam_ros.typing import Array, Index, Mask, Numbers
+from graph_slam_ros.typing import Array, Index, Mask
 
 _MOST = 200_000  # messages of each topic that are collected
 _TWIST = (0, 7, 14, 21, 28, 35)  # places in a covariance
 _UNKNOWN_M = 30.0  # so large is the sigma of an axis that a detector does not know
-_OF_ODOMETRY, _OF_GYRO, _OF_FIX, _OF_SIGHTING = 19, 7, 4, 6  # numbers of each
 SomeTopicData = TypeVar("SomeTopicData", bound="TopicData")
 
 
@@ -254,35 +253,26 @@ class _Topic:
         return TopicColumns(*self._of, log_ns, stamp_ns, self.frames)
 
 
-class _Sightings:
-    """The sightings of one input, whose mount is corrected by x, y, z, roll, pitch, yaw [m, rad]."""
+class _Input:
+    """What one input measures, and the frame of its sensor: the configured one, or the first that a message names."""
 
-    def __init__(self, name: str, topic: str, mount: Numbers) -> None:
-        self.input, self.topic, self._mount = name, topic, mount
-        self.frame, self.T_base_frame = "", se3.IDENTITY
+    def __init__(self, of: InputConfig, topic: str, *sizes: int) -> None:
+        self.of, self.topic, self.frame, self._sizes = of, topic, "", sizes
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        self._rows, self._names = _Rows(2, _OF_SIGHTING), dict[str, int]()
+        self.rows, self.names = _Rows(*self._sizes), dict[str, int]()
 
-    def add(self, m: Sightings, heights: Mapping[str, float]) -> None:
+    def note_frame(self, message: Any) -> None:
+        self.frame = self.frame or self.of.frame or _frame(message)
+
+    def add_sightings(self, m: Sightings, heights: Mapping[str, float]) -> None:
         """Collect a message, with the heights of landmarks above the base [m], by id, which the plane does not have."""
-        for one in m.sightings if self._rows.room > 0 else ():
+        for one in m.sightings if self.rows.room > 0 else ():
             (x, y, z), sigma = _located(one)
             alone = (one.measured[0] if one.kind == kind else np.nan for kind in ("range", "bearing"))
-            name = self._names.setdefault(one.id, len(self._names))
-            self._rows.add((m.stamp_ns, name), (x, y, heights.get(one.id, z), *alone, sigma))
-
-    def columns(self) -> SightingColumns:
-        (stamp_ns, name), numbers = (rows.T for rows in self._rows.columns())
-        points: Array = np.ascontiguousarray(numbers[:3].T)
-        if any(self._mount):
-            origin = np.array(self.T_base_frame[:3])
-            turned = so3.act(so3.exp(tuple(self._mount[3:])), tuple((points - origin).T))
-            points = np.stack(turned, axis=1) + origin + self._mount[:3]
-        ranges, bearings, sigmas = numbers[3:]
-        names, place = tuple(self._names), (self.frame, self.T_base_frame)
-        return SightingColumns(self.input, self.topic, stamp_ns, names, name, points, ranges, bearings, sigmas, *place)
+            name = self.names.setdefault(one.id, len(self.names))
+            self.rows.add((m.stamp_ns, name), (x, y, heights.get(one.id, z), *alone, sigma))
 
 
 class Collector:
@@ -303,16 +293,13 @@ class Collector:
         for topic in dict.fromkeys(topics[name] for name in used):
             names = tuple(name for name in used if topics[name] == topic)
             self._topics[topic] = _Topic(topic, names, used[names[0]], round(by_name[names[0]].offset_s * 1e9))
-        self._sightings = {
-            name: _Sightings(name, topics[name], _mount_correction(config, by_name[name]))
-            for name, use in used.items()
-            if use == "landmarks"
-        }
-        self._frame_of = {name: by_name[name].frame for name in used}
-        self._fixes = {name: _Rows(1, _OF_FIX) for name, use in used.items() if use == "fix"}
-        self._frames_of_fixes = dict[str, str]()
+        sizes = {"landmarks": (2, 6), "fix": (1, 4)}
+        self._inputs = {n: _Input(by_name[n], topics[n], *sizes[use]) for n, use in used.items() if use in sizes}
+        self._sightings, self._fixes = ([n for n in self._inputs if used[n] == use] for use in sizes)
+        gyro = config.gyro_input
+        self._gyro = self._inputs[gyro] = _Input(by_name.get(gyro, InputConfig(gyro)), topics.get(gyro, ""), 1, 7)
         self._odometry_topic = topics.get(self._main, "")
-        self._frame, self._child, self._gyro_frame = "", "", ""
+        self._frame, self._child = "", ""
         self.begin_anew()
         self._links: dict[tuple[str, str], None] = {}
         self._transforms = Transforms()
@@ -321,11 +308,9 @@ class Collector:
         """Drop all numbers; frames, and the places of sensors, stay."""
         for topic in self._topics.values():
             topic.begin_anew()
-        for seen in self._sightings.values():
-            seen.begin_anew()
-        self._fixes = {name: _Rows(1, _OF_FIX) for name in self._fixes}
-        self._read, self._path = _Rows(1, _OF_ODOMETRY), _Rows(1, self._config.space.pose.size)
-        self._gyro = _Rows(1, _OF_GYRO)
+        for one in self._inputs.values():
+            one.begin_anew()
+        self._read, self._path = _Rows(1, 7 + 6 + 6), _Rows(1, self._config.space.pose.size)
 
     def add(
         self,
@@ -343,16 +328,16 @@ class Collector:
             if isinstance(m, Odometry):
                 if m.source.partition("#")[0] == self._main and self._path.room:
                     self._path.add((m.stamp_ns,), m.T_odom_base)
-            elif isinstance(m, AngularVelocity) and self._gyro.room:
+            elif isinstance(m, AngularVelocity) and self._gyro.rows.room:
                 parts = (getattr(message, of, None) for of in ("angular_velocity", "linear_acceleration"))
                 felt = (getattr(part, axis, np.nan) for part in parts for axis in "xyz")  # a node has none
-                self._gyro.add((m.stamp_ns,), (m.rate[-1], *felt))
-            elif isinstance(m, Fix) and self._fixes[m.topic].room:
-                self._fixes[m.topic].add((m.stamp_ns,), _fixed(m, self._config.world.dimensions))
-            elif isinstance(m, Sightings) and m.topic in self._sightings:
+                self._gyro.rows.add((m.stamp_ns,), (m.rate[-1], *felt))
+            elif isinstance(m, Fix) and self._inputs[m.topic].rows.room:
+                self._inputs[m.topic].rows.add((m.stamp_ns,), _fixed(m, self._config.world.dimensions))
+            elif isinstance(m, Sightings) and m.topic in self._inputs:
                 if message is not None and self._config.world.dimensions == 2:
-                    heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
-                self._sightings[m.topic].add(m, heights)
+                    heights = heights or _heights(message, self._T_base(self._inputs[m.topic]) or se3.IDENTITY)
+                self._inputs[m.topic].add_sightings(m, heights)
 
     def add_run(self, topic: str, log_ns: Sequence[int], run: Sequence[Odometry], read: OdometryRun) -> None:
         """Collect messages that were converted at once: what was read of them, and the odometry of each."""
@@ -371,12 +356,8 @@ class Collector:
         for name in names:
             if name in (TF, TF_STATIC):
                 self._add_transforms(message, fixed=name == TF_STATIC)
-            elif name in self._sightings and not self._sightings[name].frame:
-                self._place(self._sightings[name], message)
-            elif name in self._fixes and name not in self._frames_of_fixes:
-                self._frames_of_fixes[name] = self._frame_of[name] or _frame(message)
-            elif name == self._config.gyro_input and not self._gyro_frame:
-                self._gyro_frame = self._frame_of[name] or _frame(message)
+            elif name in self._inputs:
+                self._inputs[name].note_frame(message)
 
     def _add_read(self, topic: str, log_ns: Sequence[int], read: OdometryRun) -> None:
         """Collect odometry that was not decoded."""
@@ -408,16 +389,11 @@ class Collector:
                 self._transforms.add(parent, child, pose(t.transform.translation, (r.x, r.y, r.z, r.w)))
             self._links[parent, child] = None
 
-    def _place(self, found: _Sightings, message: Any) -> None:
-        """Find the place of an input's sensor on the robot, by its first message that names a frame."""
-        if own := self._frame_of[found.input] or _frame(message):
-            found.frame, found.T_base_frame = own, self._T_base(found.input, own) or se3.IDENTITY
-
-    def _T_base(self, name: str, frame: str) -> se3.Pose | None:
+    def _T_base(self, one: _Input) -> se3.Pose | None:
         """The fixed pose of an input's frame on the robot, by TF, else as configured; None where neither has it."""
-        known = self._transforms.lookup(self._config.frames.base, frame)
-        of = next((one for one in self._config.sources if one.name == name), InputConfig(name))
-        mounted = tuple(map(float, assumed_mount(frame).split())) if of.mount == ASSUMED else of.numbers("mount", 6)
+        known = self._transforms.lookup(self._config.frames.base, one.frame)
+        is_assumed = one.of.mount == ASSUMED
+        mounted = tuple(map(float, assumed_mount(one.frame).split())) if is_assumed else one.of.numbers("mount", 6)
         return se3.from_xyz_rpy(mounted) if known is None and mounted else known
 
     def columns(self, counters: Counters) -> Columns:
@@ -425,32 +401,47 @@ class Collector:
         path_ns, path = self._path.columns()
         path = path if path.shape[1] == len(se3.IDENTITY) else se3.in_space(path).reshape(-1, 7)
         scale = [self._config.odometry.distance_factor] * 3 + [1.0] * 4
-        gyro_ns, turned = self._gyro.columns()
+        gyro_ns, turned = self._gyro.rows.columns()
         return Columns(
             self._config,
             {name: one.columns() for name, one in self._topics.items()},
             self._odometry(path_ns[:, 0], path),
             *in_order(path_ns[:, 0], path * scale),
-            tuple(one.columns() for one in self._sightings.values()),
+            tuple(map(self._sightings_of, self._sightings)),
             tuple(self._links),
             counters,
             self._assumed,
             gyro_ns[:, 0],
             turned[:, 0],
             turned[:, 1:],
-            self._gyro_frame,
-            self._T_base(self._config.gyro_input, self._gyro_frame),
-            tuple(self._fixes_of(name, rows) for name, rows in self._fixes.items()),
+            self._gyro.frame,
+            self._T_base(self._gyro),
+            tuple(map(self._fixes_of, self._fixes)),
         )
 
-    def _fixes_of(self, name: str, rows: _Rows) -> FixColumns:
-        topic = next((topic for topic, of in self._topics.items() if name in of.columns().inputs), name)
-        (stamp_ns,), (x, y, sigmas, headings) = (columns.T for columns in rows.columns())
-        frame, has_point = self._frames_of_fixes.get(name, ""), np.isfinite(x)
+    def _sightings_of(self, name: str) -> SightingColumns:
+        one = self._inputs[name]
+        (stamp_ns, number), columns = (rows.T for rows in one.rows.columns())
+        points: Array = np.ascontiguousarray(columns[:3].T)
+        T_base_frame = self._T_base(one) or se3.IDENTITY
+        mount = one.of.numbers("mount_correction", 6) or (0.0,) * 6
+        if self._config.world.dimensions == 2:
+            mount = (*mount[:2], 0.0, 0.0, 0.0, mount[5])
+        if any(mount):
+            origin = np.array(T_base_frame[:3])
+            turned = so3.act(so3.exp(tuple(mount[3:])), tuple((points - origin).T))
+            points = np.stack(turned, axis=1) + origin + mount[:3]
+        ranges, bearings, sigmas = columns[3:]
+        measured, place = (points, ranges, bearings, sigmas), (one.frame, T_base_frame)
+        return SightingColumns(name, one.topic, stamp_ns, tuple(one.names), number, *measured, *place)
+
+    def _fixes_of(self, name: str) -> FixColumns:
+        one = self._inputs[name]
+        (stamp_ns,), (x, y, sigmas, headings) = (columns.T for columns in one.rows.columns())
+        has_point = np.isfinite(x)
         sigma_m = float(np.median(sigmas[has_point])) if has_point.any() else 0.0
-        of_heading = "" if has_point[:1].any() else frame
-        T_base_frame = self._T_base(name, frame) or se3.IDENTITY
-        return FixColumns(name, topic, stamp_ns, x + 1j * y, headings, sigma_m, of_heading, T_base_frame)
+        place = "" if has_point[:1].any() else one.frame, self._T_base(one) or se3.IDENTITY
+        return FixColumns(name, one.topic, stamp_ns, x + 1j * y, headings, sigma_m, *place)
 
     def _odometry(self, path_ns: Index, path: Array) -> OdometryColumns:
         names = (self._main, self._odometry_topic)
@@ -460,12 +451,6 @@ class Collector:
             return OdometryColumns(*names, self._frame, self._child, stamp_ns[:, 0], *parts)
         unknown, frames = np.full((len(path), 6), np.nan), self._config.frames
         return OdometryColumns(*names, frames.odom, frames.base, path_ns, path, unknown, unknown)
-
-
-def _mount_correction(config: Config, of: InputConfig) -> Numbers:
-    """x, y, z, roll, pitch, yaw by which the mount of an input is corrected; in the plane only x, y and yaw."""
-    mount = of.numbers("mount_correction", 6) or (0.0,) * 6
-    return mount if config.world.dimensions == 3 else (*mount[:2], 0.0, 0.0, 0.0, mount[5])
 
 
 def _located(one: Sighting) -> tuple[tuple[float, float, float], float]:

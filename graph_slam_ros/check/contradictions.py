@@ -11,10 +11,11 @@ from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
 from graph_slam_ros.check.odometry import fitted, twist_factor
 from graph_slam_ros.check.pairs import (
     LATER_S,
+    LEAST_TURNED,
+    TURNED_RAD,
     Pairs,
     check_bearings,
     check_noise,
-    check_noise_alone,
     check_ranges,
     noise_of,
     noisier,
@@ -27,16 +28,16 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST_PAIRS = 30
-_TURNED_RAD, _LEAST_TURNED = 0.25, 25
-_FAR_M = 200.0
-_HALF, _FIFTH, _NOISES, _NEARLY, _NEAR_M = 0.5, 0.2, 2.0, 1.2, 0.3
-_RELATED = 0.7
-_UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
-_TWICE, _NO_IDS, _ONCE, _SELDOM = 0.002, 0.2, 0.5, 3
-_AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
-_CHANCE, _MOST_BY_CHANCE = 0.02, 2
+_FAR_M = 200.0  # the farthest of tags, cones and poles that a robot sees
+_HALF, _FIFTH = 0.5, 0.2  # of the residuals now: another explanation is right, one is right whatever the noise
+_NOISES, _NEAR_M = 2.0, 0.3  # residuals that need no other explanation: times their noise, and whatever it is
+_NEARLY, _RELATED = 1.2, 0.7  # times the best of others, or of chance: no better than these
+_UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100  # part of the motion, more than noise, by so many
+_TWICE, _NO_IDS = 0.002, 0.2  # part of the sightings: ids that are there twice, and are none
+_MOST, _SELDOM = 0.5, 3  # part of the drive without a sighting, or of the ids that are seen less often
+_AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25  # a landmark that comes back, and the part of a drive that one is to span
+_CHANCE, _MOST_BY_CHANCE = 0.02, 2  # part of the landmarks, and of many: all ids change, but these
 _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of the drive
-_SILENT = 0.5
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
 _SIGMAS, _OTHER_SCALE, _LEAST_SCALE = 4.0, 0.15, 0.1  # a fit finds less than _OTHER_SCALE
@@ -64,7 +65,7 @@ def check_contradictions(c: Columns) -> Iterator[Finding]:
         found = list(check_ranges(c, s))
         if c.config.world.dimensions == 2:
             found += check_bearings(c, s)
-        found += [*check_noise_alone(c, s), *_contradictions(c, s)]
+        found += [*check_noise(c, s), *_contradictions(c, s)]
         yield from found
         if not any(one.ends for one in found):
             yield from _coverage(s, c.path_ns, c.path)
@@ -155,8 +156,8 @@ def _turned(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose
 
 def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> Finding | None:
     """A mirror shows only where the robot turns."""
-    turns = pairs.turned > _TURNED_RAD
-    if turns.sum() < _LEAST_TURNED:
+    turns = pairs.turned > TURNED_RAD
+    if turns.sum() < LEAST_TURNED:
         return None
     turning = pairs.some(turns)
     if (now_m := turning.apart_m(s.points)) <= min(_NOISES * noise_m, _NEAR_M):
@@ -181,9 +182,9 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
 def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Finding | None:
     if (now_m := pairs.apart_m(s.points)) <= min(_NOISES * noise_m, _NEAR_M):
         return None
-    points, mounts, turning = _hypotheses(s), _mounts(s), pairs.some(pairs.turned > _TURNED_RAD)
+    points, mounts, turning = _hypotheses(s), _mounts(s), pairs.some(pairs.turned > TURNED_RAD)
     del points[MIRRORED]
-    both = (pairs, turning) if len(turning.a) >= _LEAST_TURNED else (pairs,)  # along a line another fits, too
+    both = (pairs, turning) if len(turning.a) >= LEAST_TURNED else (pairs,)  # along a line another fits, too
     left = {what: max(some.apart_m(there) for some in both) for what, there in points.items()}
     if pairs.dimensions == 2 and len(both) > 1:
         starts = {"turned": tuple(s.T_base_frame), **{what: mounts[what] for what in (_AHEAD, _OPTICAL)}}
@@ -274,17 +275,17 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
     between = np.diff([0, *np.searchsorted(path_ns, np.sort(s.stamp_ns[inside])), len(path_ns)])
     silent = float(between.max()) / len(path_ns)
-    if silent > _SILENT:
+    if silent > _MOST:
         text = f"nothing is seen for {silent:.0%} of the drive, for {int(between.max())} poses of odometry"
-        yield s.finding("silent", "warning", silent, _SILENT, "part", text)
+        yield s.finding("silent", "warning", silent, _MOST, "part", text)
     chosen = np.flatnonzero(s.named(path_ns))
     if not len(chosen):
         return
     times = np.bincount(s.name[chosen])
     seldom = float((times[times > 0] < _SELDOM).mean())
-    if seldom > _ONCE:
+    if seldom > _MOST:
         text = f"{seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
-        yield s.finding("seen_once", "warning", seldom, _ONCE, "part", text)
+        yield s.finding("seen_once", "warning", seldom, _MOST, "part", text)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds = (path_ns - path_ns[0]) * 1e-9
     reach_m, few, comes_back = seen_over(s, chosen, path_ns[0], seconds, driven)

@@ -9,17 +9,18 @@ from graph_slam_ros.check.columns import Columns, FixColumns
 from graph_slam_ros.check.contradictions import factor_setting, turned_mount
 from graph_slam_ros.check.odometry import TOGETHER, worst_stretch
 from graph_slam_ros.check.pairs import poses_at
-from graph_slam_ros.check.times import offset_setting
+from graph_slam_ros.check.times import MOST_LATE_S, offset_setting
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.typing import Array, Index
 
-_LEAST, _STEP_M, _SIGMAS, _SCALE = 8, 2.0, 6.0, 1.5
-_TURNED_RAD, _HALF, _OFF_RAD, _NEARLY_RAD = 0.2, 0.5, 0.17, 0.1
-_SAME_M, _FROZEN_M, _JUMP_M, _SOON_S, _OFF = 1e-6, 3.0, 3.0, 2.0, 0.1  # _OFF: of odometry's distances
-_STEP_NS, _SLIP_M, _SLIP_PART, _SLIP_SIGMAS = 2_000_000_000, 2.0, 0.25, 5.0
-_STANDS, _SPINS = 0.05, 3.0  # of odometry's turns: less, or more, is no heading
-_WINDOW_S, _MOST_LATE_S, _LATE_S, _BETTER = 20.0, 1.0, 0.15, 0.9
+_LEAST, _STEP_M, _SIGMAS = 8, 2.0, 6.0  # fixes, and how far apart those are whose motion is compared: m, sigmas
+_TURNED_RAD, _HALF = 0.2, 0.5  # of steps that tell a mirror, and what is left of their differences with it
+_SCALE, _OFF = 1.5, 0.1  # times: no odometry is so wrong; part of its distances that a fit leaves, or is off by
+_SAME_M, _FAR_M = 1e-6, 3.0  # of a fix that stands, and what nobody takes for noise
+_STEP_S, _SLIP_M, _SLIP_PART, _SLIP_SIGMAS = 2.0, 2.0, 0.25, 5.0  # a step, and the least of five: of it, of the usual
+_OFF_RAD, _STANDS, _SPINS = 0.17, 0.05, 3.0  # ten degrees; of odometry's turns: less, or more, is no heading
+_WINDOW_S, _LATE_S, _BETTER = 20.0, 0.15, 0.9  # _BETTER: squares that another time leaves
 
 
 def check_fixes(c: Columns) -> Iterator[Finding]:
@@ -73,10 +74,10 @@ def _frozen(c: Columns, f: FixColumns, own: Array) -> Iterator[Finding]:
     way_m, moves = np.abs(np.diff(own)), np.abs(np.diff(f.points)) > _SAME_M
     begins = np.flatnonzero(np.concatenate([[True], moves]))
     for k, end in zip(begins, [*(begins[1:] - 1), len(own) - 1], strict=True):
-        if (drove_m := float(way_m[k:end].sum())) > _FROZEN_M:
+        if (drove_m := float(way_m[k:end].sum())) > _FAR_M:
             span_s = (f.stamp_ns[end] - f.stamp_ns[k]) * 1e-9
             text = f"the fix stands still for {span_s:.0f} s, while odometry drives {drove_m:.0f} m"
-            yield f.finding("fix_frozen", "warning", drove_m, _FROZEN_M, "m", text, at=f.stamp_ns[k:end])
+            yield f.finding("fix_frozen", "warning", drove_m, _FAR_M, "m", text, at=f.stamp_ns[k:end])
 
 
 def _turned(c: Columns, f: FixColumns, own: Array) -> Iterator[Finding]:
@@ -108,8 +109,8 @@ def _turned(c: Columns, f: FixColumns, own: Array) -> Iterator[Finding]:
             settings = setting if is_odometry else ()
             yield f.finding("odometry_scale", severity, factor, 1.0 + _OFF, "times", text, settings=settings)
     step_m, way_m = np.abs(np.diff(f.points)), np.abs(np.diff(own))
-    far_m = max(_JUMP_M, 2.0 * _SIGMAS * f.sigma_m)
-    jumps = (step_m - way_m > far_m) & (np.diff(f.stamp_ns) < _SOON_S * 1e9)
+    far_m = max(_FAR_M, 2.0 * _SIGMAS * f.sigma_m)
+    jumps = (step_m - way_m > far_m) & (np.diff(f.stamp_ns) < _STEP_S * 1e9)
     if jumps.any():
         often = "once" if jumps.sum() == 1 else f"{jumps.sum()} times"
         stays = bool(abs(np.diff(f.points)[jumps].sum()) > far_m)
@@ -125,13 +126,13 @@ def _late(c: Columns, f: FixColumns, own: Array) -> Iterator[Finding]:
     path_s, at_s = ((some_ns - c.path_ns[0]) * 1e-9 for some_ns in (c.path_ns, f.stamp_ns))
     begins = np.flatnonzero(np.diff(at_s // _WINDOW_S)) + 1
     windows = [k for k in np.split(np.arange(len(at_s)), begins) if len(k) >= _LEAST]
-    tried_s = np.arange(-_MOST_LATE_S, _MOST_LATE_S + 0.01, _LATE_S / 3.0)
+    tried_s = np.arange(-MOST_LATE_S, MOST_LATE_S + 0.01, _LATE_S / 3.0)
     paths = (np.interp(at_s - late_s, path_s, antenna) for late_s in tried_s)
     left = [[_left(own[k], f.points[k]) for k in windows] for own in paths]
     halves = [np.sum([row[n::2] for row in left], axis=1) for n in (0, 1)]
     first_s, second_s, late_s = (float(tried_s[np.argmin(some)]) for some in (*halves, sum(halves)))
     is_better = min(sum(halves)) < _BETTER * sum(halves)[len(tried_s) // 2]
-    if is_better and _LATE_S <= abs(late_s) < _MOST_LATE_S - 0.01 and abs(first_s - second_s) < _LATE_S:
+    if is_better and _LATE_S <= abs(late_s) < MOST_LATE_S - 0.01 and abs(first_s - second_s) < _LATE_S:
         when = f"{abs(late_s) * 1e3:.0f} ms {'earlier' if late_s > 0.0 else 'later'} than stamped"
         settings = (offset_setting(c, f.input, -late_s),)
         text = f"fixes agree with odometry best {when}, or their antenna is elsewhere on the robot"
@@ -145,7 +146,7 @@ def _left(own: Array, points: Array) -> float:
 
 def _slipped(c: Columns, f: FixColumns, own: Array) -> Iterator[Finding]:
     """A stretch in which fixes move by far more or less than odometry: of the two, one is wrong."""
-    begins = np.flatnonzero(np.diff((f.stamp_ns - f.stamp_ns[0]) // _STEP_NS, prepend=-1))
+    begins = np.flatnonzero(np.diff((f.stamp_ns - f.stamp_ns[0]) // round(_STEP_S * 1e9), prepend=-1))
     counts = np.diff([*begins, len(own)])
     moved, driven = (np.abs(np.diff(np.add.reduceat(x, begins) / counts))[:, None] for x in (f.points, own))
     if found := worst_stretch(moved - driven, driven, np.array([_SLIP_M]), _SLIP_PART, _SLIP_SIGMAS):
@@ -177,7 +178,7 @@ def _headings(f: FixColumns, yaws: Array, known: tuple[Index, Array] | None) -> 
         if abs(off) > _OFF_RAD and np.median(np.abs(np.angle(turned * np.exp(-1j * off)))) < _HALF * abs(off):
             text = f"its heading is {np.degrees(off):.0f} degrees off the course of the fixes (0 is east)"
             quarter = round(off / (0.5 * np.pi)) * 0.5 * np.pi
-            off = quarter if abs(off - quarter) < _NEARLY_RAD else off
+            off = quarter if abs(off - quarter) < _OFF_RAD else off
             turn = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5 * off), np.cos(0.5 * off))
             settings = turned_mount(f.input, f.frame, f.T_base_frame, turn) if f.frame else ()
             yield f.finding("heading_offset", "error", off, _OFF_RAD, "rad", text, settings=settings)

@@ -10,20 +10,20 @@ from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.odometry import fitted
 from graph_slam_ros.check.pairs import poses_at
-from graph_slam_ros.check.times import offset_setting
+from graph_slam_ros.check.times import MOST_LATE_S, offset_setting
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Numbers
 
-_WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
-_TURNING_RAD, _LEAST_TURNING = 0.1, 10
-_SCALE, _GROSS, _UNEXPLAINED, _BIAS_SIGMAS = 0.1, 0.4, 0.5, 3.0
+_WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3  # in which both turn, how many, and samples in each
+_TURNING_RAD, _LEAST_TURNING = 0.1, 10  # windows in which the robot turns
+_SCALE, _GROSS, _BIAS_SIGMAS = 0.1, 0.4, 3.0  # of a factor that is wrong, and of another cause than the track width
+_UNEXPLAINED = 0.5  # part of the turns, or of a wrong heading: more is left where another cause is
 _OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but others
-_EXPLAINED = 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
 _EITHER = ": the track width is wrong, or the scale of the gyro"
 _OF_A_HEADING = ("id_reused", "ids_unsure", "landmark_moved", "map_breaks", "outliers")  # where that is wrong
-_GRAVITY_M_S2, _LEAST_LATE_S, _MOST_LATE_S = 9.81, 0.1, 1.0
+_GRAVITY_M_S2, _LEAST_LATE_S = 9.81, 0.1  # _LEAST_LATE_S: between two that are tried there are two steps
 _MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
 
 
@@ -62,7 +62,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
 
 def _late_s(c: Columns) -> float:
     """Return how much too late the gyro is stamped, where odometry's turns are its own only then; else 0."""
-    tried_s = np.arange(-_MOST_LATE_S, _MOST_LATE_S + 0.01, _LEAST_LATE_S / 2.0)
+    tried_s = np.arange(-MOST_LATE_S, MOST_LATE_S + 0.01, _LEAST_LATE_S / 2.0)
     turns = (_turns(replace(c, gyro_ns=c.gyro_ns - round(float(late_s) * 1e9))) for late_s in (0.0, *tried_s))
     now, *left = (1.0 - abs(float(np.corrcoef(*both)[0, 1])) for both in turns)
     late_s = float(tried_s[int(np.argmin(left))])
@@ -144,7 +144,7 @@ def of_gyro_or_wheels(findings: list[Finding], gyro_input: str) -> list[Finding]
     if gyro is None or turn is None:
         return findings
     rest = [one for one in findings if one is not turn]
-    if abs((1.0 + turn.value) * gyro.value - 1.0) > _EXPLAINED * abs(turn.value):
+    if abs((1.0 + turn.value) * gyro.value - 1.0) > _UNEXPLAINED * abs(turn.value):
         return rest  # both are wrong: the gyro's finding says by how much they differ
     text = f"{gyro.text.removesuffix(_EITHER)}: landmarks agree with odometry, so the scale of the gyro is wrong"
     mended = replace(gyro, text=text, settings=(assignment(f"{gyro_input}.use", "none"),))

@@ -11,11 +11,11 @@ from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
 
-_LEAST_PAIRS, _LEAST_NAMES = 10, 3
-_NOISES, _HALF = 4.0, 0.5
+_LEAST_PAIRS, _LEAST_NAMES = 10, 3  # of a landmark; landmarks of a fixed frame
+_NOISES, _HALF = 4.0, 0.5  # by which a landmark moves on the ground; of that, on the robot that carries it
 _MOST, _SOME = 0.8, 0.3  # part of the pairs of one landmark that moves; part of the landmarks that may
-_TIMES, _NEARLY_ALL = 3.0, 0.9
-_MOST_NAMED, _SAMPLED, _ABOUT_NS = 5, 60, 10_000_000_000
+_TIMES, _NEARLY_ALL = 3.0, 0.9  # as far as this part of the others
+_MOST_NAMED, _SAMPLED, _ABOUT_NS = 5, 60, 10_000_000_000  # findings; sightings about which, and for so long, one stays
 
 
 @dataclass(frozen=True, slots=True, eq=False)

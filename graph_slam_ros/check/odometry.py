@@ -9,36 +9,42 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, OdometryColumns
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import rounded_s
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.messages.inputs.odometry import UNUSED
+from graph_slam_ros.messages.inputs.source import LEVEL_M
 from graph_slam_ros.typing import Array, Mask
 
 LEAST = 10
 """Messages of odometry below which nothing is known of it."""
 
-_FASTEST_M_S = 40.0
-_FASTEST_RAD_S, _LEAST_S = 12.0, 0.02  # of steps that are shorter, noise would pass for a turn
-_STEP_M, _STEP_RAD, _TIMES = 0.1, 0.1, 5.0
+_FASTEST_M_S, _FASTEST_RAD_S = 40.0, 12.0  # of any robot
+_LEAST_S = 0.02  # of steps that are shorter, noise would pass for a turn
+_STEP, _TIMES = 0.1, 5.0  # m and rad, and times the fastest: a step that is longer is a jump
 _FEW, _FEW_JUMPS, _MANY = 0.01, 5.0, 0.1  # steps that may be jumps: a share, so many, and the most of few messages
-_CORRECTED = 3
+_CORRECTED = 3  # jumps: a driver that restarts, or is lifted, makes fewer
 _LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: times the fastest, and at least
 _IRREGULAR = 2.5  # spread of the times between messages, in medians; 3.2 where they come at random
-_AT_ZERO, _AWAY_M = 1e-9, 0.5
-_STILL_M, _STILL_RAD = 0.5, 1.0
-_NO_TURN_RAD, _BENDS, _TURNS = 1e-6, 0.05, 0.2  # _TURNS: of a quaternion's numbers
+_AT_ZERO, _AWAY_M = 1e-9, 0.5  # of a driver that was restarted: m and rad, and where it was before
+_STILL_M, _STILL_RAD = 0.5, 1.0  # of a whole drive
+_NO_TURN_RAD, _TURNS = 1e-6, 0.2  # _TURNS: of a quaternion's numbers
+_BENDS = 0.05  # of the squares of a way, those across it
 _SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
-_WINDOW_S, _LONGEST_S = 1.0, 3.0
+_WINDOW_S, _LONGEST_S = 1.0, 3.0  # over which pose and twist are compared, and with a gap
 _LEAST_WIDTH = 4  # messages in a window: between fewer, the speed may be any
-_SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
+_SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7  # of a factor, and what it leaves: clearly explained, or clearly not
 _AT_REST = 0.05  # of the root mean square
-_LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
-_TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 1e3, 0.05, 1e-4
-_OFF_PLANE, _LEVEL_M = 0.05, 0.5
+_LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02  # sideways by ahead; of what is left, and that
+_TINY, _USELESS, _SLOWEST_M_S = 1e-3, 3.0, 0.05  # sigmas by the fastest speed, and what that is at least
+_TINY_RAD_S = 1e-4  # no wheels are so good
+_OFF_PLANE = 0.05  # part of the poses
 TOGETHER = 5
 """Steps that are summed for a slip."""
-_ROUNDS = 10
-_SIGMA, _LEAST_STRETCHES = 1.4826, 20  # _SIGMA: of a median absolute deviation
+_ROUNDS = 10  # of reweighting
+_LEAST_STRETCHES = 20  # of fewer sums the usual scale is not known
+_ELSEWHERE_M, _OTHER_ROBOT_M = 0.3, 2.0  # poses that are not used; another driver begins where this one does
 _UNITS = {
     -1.0: "mirrored",
     57.29578: "radians for degrees",
@@ -46,7 +52,6 @@ _UNITS = {
     1000.0: "metres for thousands",
     1e-3: "millimetres for metres",
 }
-_ELSEWHERE_M, _OTHER_ROBOT_M = 0.3, 2.0
 _DENSITY, _SPACE = ("odometry.noise=density",), ("world.dimensions=3",)
 
 
@@ -81,8 +86,8 @@ class Steps:
     def jumps(self) -> Mask:
         """(n,) Steps that are far longer than the others."""
         dt = np.maximum(self.dt, float(np.median(self.dt)))
-        far = np.linalg.norm(self.moved, axis=1) > _STEP_M + _TIMES * self.fastest_m_s * dt
-        return far | (np.linalg.norm(self.turned, axis=1) > _STEP_RAD + _TIMES * self.fastest_rad_s * dt)
+        far = np.linalg.norm(self.moved, axis=1) > _STEP + _TIMES * self.fastest_m_s * dt
+        return far | (np.linalg.norm(self.turned, axis=1) > _STEP + _TIMES * self.fastest_rad_s * dt)
 
 
 def _without_jumps(speeds: Array) -> float:
@@ -262,7 +267,7 @@ def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
     out = c.counters[o.input, "out_of_plane"]
     share = out / len(o.poses)
     if share > _OFF_PLANE and c.config.world.dimensions == 2:
-        text = f"{share:.0%} of the poses are more than {_LEVEL_M} m above or below the first, or tilted"
+        text = f"{share:.0%} of the poses are more than {LEVEL_M} m above or below the first, or tilted"
         yield o.finding("not_planar", "warning", share, _OFF_PLANE, "part", text, out, settings=_SPACE)
 
 
@@ -357,7 +362,7 @@ def worst_stretch(errors: Array, sizes: Array, least: Array, part: float, sigmas
         return None
     errors, sizes = (np.stack([np.convolve(x, np.ones(TOGETHER), "valid") for x in rows.T]) for rows in (errors, sizes))
     errors = errors - np.median(errors, axis=1, keepdims=True)
-    scale = _SIGMA * np.median(np.abs(errors), axis=1)
+    scale = np.median(np.abs(errors), axis=1) / quantile(0.5, 1) ** 0.5
     limits = np.maximum(np.maximum(sigmas * scale, least)[:, None], part * sizes)
     column, first = (int(k) for k in np.unravel_index(np.argmax(np.abs(errors) / limits), errors.shape))
     error, limit = float(errors[column, first]), float(limits[column, first])
@@ -367,13 +372,7 @@ def worst_stretch(errors: Array, sizes: Array, least: Array, part: float, sigmas
 def _covariance(o: OdometryColumns, steps: Steps) -> Iterator[Finding]:
     """The variances of the twist against what the robot does."""
     used = o.variances[:, [0, 1, 5]]
-    bad = ~np.isfinite(used).all(axis=1) | (used < 0.0).any(axis=1)
-    if bad.any():
-        text = f"{int(bad.sum())} messages have a variance of the twist that is negative or not a number"
-        severity: Severity = "error" if bad.mean() > 0.5 else "warning"  # such messages are refused
-        yield o.finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY)
-        return
-    if not used.any() or (np.median(used, axis=0) >= _UNUSED_M_S**2).any():
+    if not used.any() or (np.median(used, axis=0) >= UNUSED).any():
         return
     sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
     if sigmas[0] > _USELESS * speed:

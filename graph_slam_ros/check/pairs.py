@@ -5,13 +5,13 @@ as the robot turns to the left.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
@@ -20,13 +20,17 @@ LATER_S = 6.0
 """Most time between both."""
 ASSUMED_RANGE_M, ASSUMED_BEARING_RAD = 0.5, 0.02
 """Standard deviations of ranges and bearings whose noise nobody has stated."""
+TURNED_RAD, LEAST_TURNED = 0.25, 25
+"""The least turn between two sightings that tells a mirror, and how many of these."""
 _TYPICAL_M = 0.05  # what odometry and a detector err within a few seconds, at most, where nothing is wrong
-_SOONEST_S, _MOVED, _MOST_PAIRS = 0.3, 0.15, 4000
-_RANGE_LATER_S, _DRIVEN_M, _LEAST_RANGES, _FASTEST = 30.0, 1.0, 20, 10.0
+_SOONEST_S, _MOVED, _MOST_PAIRS = 0.3, 0.15, 4000  # between both, at least: m or rad; of more, some at equal steps
+_DRIVEN_M, _FASTEST = 1.0, 10.0  # _FASTEST: m/m, which no outliers make
 _MOST, _FEWEST = 1.3, 0.1  # m/m, which nearly none exceeds: feet, where beacons are ahead or behind
-_QUARTILE, _OF_RAYLEIGH, _WORSE = 0.25, 0.7585, 3.0
-_RAISED, _TINY, _TOO_SMALL = 0.5, 1e-3, 10.0
-_BEARING_LATER_S, _TURNED_RAD, _LEAST_BEARINGS, _MIRRORED = 2.0, 0.25, 25, 0.5
+_QUARTILE, _WORSE = 0.25, 3.0  # as a run allows for
+_OF_RAYLEIGH = quantile(_QUARTILE, 2) ** 0.5  # the quartile of distances, in sigmas of an axis
+_RAISED, _TINY = 0.5, 1e-3  # part of the sightings whose sigma was raised, and to less than that [m]
+_TOO_SMALL = 10.0  # of their sigmas, by which two of them differ
+_BEARING_LATER_S, _MIRRORED = 2.0, 0.5  # in which a bearing changes by the turn; rad/rad, half-way from 0 to 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,16 +77,16 @@ def poses_at(stamp_ns: Index, path_ns: Index, path: Array) -> Array:
     return np.stack(se3.interpolate(tuple(path[before].T), tuple(path[after].T), part), axis=1)
 
 
-def pairs_of(c: Columns, s: SightingColumns) -> Pairs:
-    """Pairs of sightings between which the robot moved, at most 6 s apart."""
-    use = np.flatnonzero(s.located(c.path_ns))
+def pairs_of(c: Columns, s: SightingColumns, which: Mask | None = None, later_s: float = LATER_S) -> Pairs:
+    """Pairs of sightings between which the robot moved, at most so much later; of those with a position by default."""
+    use = np.flatnonzero(s.located(c.path_ns) if which is None else which)
     order = use[np.argsort(s.stamp_ns[use], kind="stable")]
     seconds = ((s.stamp_ns - c.path_ns[0]) * 1e-9).tolist()
     names, found = s.name.tolist(), []
     recent: dict[int, deque[int]] = {}
     for k in order.tolist():
         held = recent.setdefault(names[k], deque())
-        while held and seconds[k] - seconds[held[0]] > LATER_S:
+        while held and seconds[k] - seconds[held[0]] > later_s:
             held.popleft()
         if held and seconds[k] - seconds[held[0]] > _SOONEST_S:
             found.append((held[0], k))
@@ -115,27 +119,26 @@ def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
         )
 
 
-def check_noise(c: Columns, s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
-    """A covariance that nobody has measured: it was raised to the least that a replay allows, and that is too small."""
+def check_noise(c: Columns, s: SightingColumns, pairs: Pairs | None = None) -> Iterator[Finding]:
+    """A covariance that nobody has measured: it was raised to the least that a replay allows, and that is too small.
+
+    Pairs tell how small. No two ranges or bearings alone can be compared, but no sensor is so exact.
+    """
     raised, sigma_m = _raised(c, s), float(np.median(s.sigmas))
-    if not raised or not len(pairs.a):
-        return
-    factor = float(np.median(pairs.residuals(s.points) / s.sigmas[pairs.a]))
-    if factor > _TOO_SMALL:
-        few = f"the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
-        text = f"{few}, and two sightings of a landmark differ by {factor * sigma_m:.2g} m"
-        yield s.finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, raised, settings=_sigmas(s, pairs))
-
-
-def check_noise_alone(c: Columns, s: SightingColumns) -> Iterator[Finding]:
-    """The same of ranges or bearings alone, of which no two can be compared: no sensor is so exact."""
-    raised = _raised(c, s)
-    if raised and not np.isfinite(s.points).any():
-        text = f"the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
+    few = f"the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
+    if raised and pairs is not None and len(pairs.a):
+        factor = float(np.median(pairs.residuals(s.points) / s.sigmas[pairs.a]))
+        if factor > _TOO_SMALL:
+            text, settings = (
+                f"{few}, and two sightings of a landmark differ by {factor * sigma_m:.2g} m",
+                _sigmas(s, pairs),
+            )
+            yield s.finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, raised, settings=settings)
+    elif raised and not np.isfinite(s.points).any():
         has_ranges = np.isfinite(s.ranges).any()
         sigma = f"sigma_m={ASSUMED_RANGE_M}" if has_ranges else f"sigma_rad={ASSUMED_BEARING_RAD}"
         settings, share = (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}"), raised / len(s.stamp_ns)
-        yield s.finding("noise_zero", "warning", share, _RAISED, "part", text, raised, settings=settings)
+        yield s.finding("noise_zero", "warning", share, _RAISED, "part", few, raised, settings=settings)
 
 
 def _raised(c: Columns, s: SightingColumns) -> int:
@@ -154,52 +157,26 @@ def _sigmas(s: SightingColumns, pairs: Pairs) -> tuple[str, ...]:
 
 def check_ranges(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     """Ranges alone in other units than metres."""
-    use = np.flatnonzero(np.isfinite(s.ranges) & s.named(c.path_ns))
-    places = poses_at(s.stamp_ns[use], c.path_ns, c.path)[:, :3]
-    each = _changes(s, use, s.ranges, places, _RANGE_LATER_S, _DRIVEN_M, lambda a, b: float(np.linalg.norm(b - a)))
-    factor, least = np.quantile(np.abs(each), [0.5, _FEWEST]).tolist() if len(each) >= _LEAST_RANGES else (0.0, 0.0)
+    use = np.isfinite(s.ranges) & s.named(c.path_ns)
+    pairs = pairs_of(c, s, use)
+    driven_m = np.linalg.norm(pairs.motion[:, :3], axis=1)
+    pairs, driven_m = pairs.some(driven_m > _DRIVEN_M), driven_m[driven_m > _DRIVEN_M]
+    each = np.abs(s.ranges[pairs.b] - s.ranges[pairs.a]) / driven_m
+    factor, least = np.quantile(each, [0.5, _FEWEST]).tolist() if len(each) >= LEAST_TURNED else (0.0, 0.0)
     if factor > _FASTEST or least > _MOST:
         text = f"ranges change by {factor:.3g} for each metre of odometry: are both metres?"
-        yield s.finding("units", "error", factor, _MOST, "m/m", text, len(use))
+        yield s.finding("units", "error", factor, _MOST, "m/m", text, use.sum())
 
 
 def check_bearings(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     """Bearings alone, in the plane, that count to the right."""
-    use = np.flatnonzero(np.isfinite(s.bearings) & s.named(c.path_ns))
-    headings = np.stack(so3.log(tuple(poses_at(s.stamp_ns[use], c.path_ns, c.path)[:, 3:].T)), axis=1)[:, 2]
-    turned = lambda a, b: float(se2.wrap(b - a))  # noqa: E731
-    each = _changes(s, use, s.bearings, headings, _BEARING_LATER_S, _TURNED_RAD, turned, turned)
-    factor = float(np.median(each)) if len(each) >= _LEAST_BEARINGS else 0.0
+    use = np.isfinite(s.bearings) & s.named(c.path_ns)
+    pairs = pairs_of(c, s, use, _BEARING_LATER_S)
+    turned = np.asarray(so3.log(tuple(pairs.motion[:, 3:].T))[2])
+    pairs, turned = pairs.some(np.abs(turned) > TURNED_RAD), turned[np.abs(turned) > TURNED_RAD]
+    each = se2.wrap(s.bearings[pairs.b] - s.bearings[pairs.a]) / turned
+    factor = float(np.median(each)) if len(each) >= LEAST_TURNED else 0.0
     if factor > _MIRRORED:
         text = f"bearings change by {factor:+.2f} rad for each radian that the robot turns to the left, and "
         text += "-1 is expected: do they count to the right, or does odometry turn the other way?"
-        yield s.finding("mirrored", "error", factor, _MIRRORED, "rad/rad", text, len(use))
-
-
-def _changes(
-    s: SightingColumns,
-    chosen: Index,
-    measured: Array,
-    at: Array,
-    later_s: float,
-    least: float,
-    moved_between: Callable[[Any, Any], float],
-    changed: Callable[[float, float], float] = lambda a, b: b - a,
-) -> Array:
-    """Return the change of what is measured (k,) of each landmark, per metre or radian that the robot has moved.
-
-    ``at`` is where it is at each ``chosen`` sighting, ``moved_between`` the motion between two of these, ``least`` in
-    so many seconds.
-    """
-    found = []
-    for name in np.unique(s.name[chosen]):
-        own = np.flatnonzero(s.name[chosen] == name)
-        rows = own[np.argsort(s.stamp_ns[chosen[own]], kind="stable")].tolist()
-        first = rows[0]
-        for k in rows[1:]:
-            if (s.stamp_ns[chosen[k]] - s.stamp_ns[chosen[first]]) * 1e-9 > later_s:
-                first = k
-            elif abs(moved := moved_between(at[first], at[k])) > least:
-                found.append(changed(float(measured[chosen[first]]), float(measured[chosen[k]])) / moved)
-                first = k
-    return np.array(found)
+        yield s.finding("mirrored", "error", factor, _MIRRORED, "rad/rad", text, use.sum())

@@ -1,5 +1,6 @@
 """A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
@@ -9,6 +10,7 @@ from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.identities import at_two_places, check_moved, check_outliers, check_reused
 from graph_slam_ros.check.odometry import TOGETHER, twist_factor, worst_stretch
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
+from graph_slam_ros.check.times import EARLY_S
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
@@ -22,27 +24,25 @@ from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.slam.noise.scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
-_THIN_NS, _APART_S = 80_000_000, 1.0
+_THIN_NS, _APART_S = 80_000_000, 1.0  # between odometry, and between keyframes, of a replay that a fit begins at
 _COARSE = {"solve.every_keyframes": 20, "odometry.doubt": False, "map.condense": False}  # a fit needs all keyframes
-_SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
-_RECORDED_S, _EARLY_S = 5.0, 0.15  # by one clock, and before what a stamp says
+_RECORDED_S = 5.0  # by one clock
 _OF_STEP = 0.25  # of the time between two poses of odometry
-_DEGREE = np.pi / 180.0
 # By parameter: unit, limit, and from which sigma on it is not observable.
 _LIMITS = {
     "clock": ("s", 0.03, 0.05),
-    "yaw": ("rad", 3.0 * _DEGREE, 3.0 * _DEGREE),
+    "yaw": ("rad", math.radians(3.0), math.radians(3.0)),
     "x": ("m", answers.LEAST_M, np.inf),
     "y": ("m", answers.LEAST_M, np.inf),
     **dict.fromkeys(("distance", "turn", "range_factor"), ("part", 0.03, 0.05)),
     "range_offset": ("m", 0.1, np.inf),
 }
-_OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
+_OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT = 2.0, 6.0**0.5  # sigmas: wheels that slip now and then are no fault
 _OF_A_BREAK = ("ids_unsure", "map_breaks", "landmark_moved")  # a robot that was carried has them with right ids
-_MOST, _SHIFTS = 0.9, 2.0
-_LEAST_M, _LEAST_RAD, _PART, _SLIP_SIGMAS = 0.15, 0.3, 0.1, 6.0
-_LARGE_SIGMAS, _LARGE_M, _LARGE_RAD = 12.0, 0.5, 0.8
+_MOST, _SHIFTS = 0.9, 2.0  # part of the sightings that a clock moves by less; times that, between two places
+_LEAST_M, _LEAST_RAD, _PART, _SLIP_SIGMAS = 0.15, 0.3, 0.1, 6.0  # of a slip; _PART: of the way
+_LARGE_M, _LARGE_RAD, _LARGE_SIGMAS = 0.5, 0.8, 2.0 * _SLIP_SIGMAS  # of one that is no note
 
 
 def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
@@ -129,7 +129,7 @@ def _noise(c: Columns, view: MapView, *, has_cause: bool) -> Iterator[Finding]:
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
         is_allowed_for = c.config.robust.noise_scale == "estimated" and noise.factor < LARGEST
-        if factor > limit and noise.dof > _LEAST_DOF and not noise.reason and not is_allowed_for:
+        if factor > limit and not noise.reason and not is_allowed_for:
             yield _over_confident(c, noise, factor, limit)
 
 
@@ -150,7 +150,7 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
 def _is_far_off(fit: TrialFit, one: answers.Fitted, step_s: float) -> bool:
     """Return whether a parameter is far off by its limit and several sigmas. Between two poses a clock is no proof."""
     limit = max(_LIMITS.get(one.parameter.name, ("", np.inf))[1], _OF_STEP * step_s * (one.parameter.name == "clock"))
-    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
+    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else answers.SIGMAS
     return answers.is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 
 
@@ -166,7 +166,7 @@ def _fitted(
         is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
         told = answers.off_by(fit, one.parameter, off, view.corrections.total, may_be_ranges=not is_pose)
         setting, lag_s, own = told.setting, float(np.median(topic.lag_s)), c.odometry.input
-        if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
+        if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - EARLY_S:  # none is recorded before it is seen
             setting = f"{own}.offset_s", round(view.corrections.total(own, "clock") - one.value, 3)
         is_open = code == "odometry_scale" and not is_pose
         settings = () if is_open or not setting else (assignment(*setting),)

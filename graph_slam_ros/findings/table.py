@@ -253,7 +253,6 @@ CHECKED: dict[str, Row] = {
     "twist_scale": _checked(_DENSITY),
     "twist_frame": _checked(_DENSITY),
     "twist_unrelated": _checked(_DENSITY),
-    "covariance_negative": _checked(_DENSITY),
     "covariance_tiny": _checked(_DENSITY, hides=_OF_A_PATH),
     "covariance_useless": _checked(_DENSITY),
     # -- fixes and headings

@@ -18,7 +18,7 @@ from graph_slam_ros.typing import Numbers
 TYPE = "nav_msgs/msg/Odometry"
 _MOST_SIMILAR, _LONGEST = 3, 80  # transforms that are named, and letters of a frame's name
 _SLASHED = ("/", "")
-_UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what these do not measure
+UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what these do not measure
 
 
 def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
@@ -182,7 +182,7 @@ def _judged(source: InputContext, full: Any) -> tuple[Numbers | MessageError | N
     if not block.any():
         return None, ["covariance_unknown"]
     variances = np.diag(block)
-    if (variances >= _UNUSED).any() or (source.space.dimensions == 3 and (variances == 0.0).any()):
+    if (variances >= UNUSED).any() or (source.space.dimensions == 3 and (variances == 0.0).any()):
         return None, ["covariance_of_some_axes_unknown"]
     try:
         covariance, repairs = checks.covariance(block, source.space.dimensions)
