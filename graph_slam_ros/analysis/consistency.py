@@ -136,11 +136,6 @@ class Consistency:
         return "\n".join(lines)
 
 
-def _growth(one: NoiseScale) -> str:
-    """Say that the noise is larger in motion, if it is."""
-    return ", more in motion" if one.per_rad > 0.0 or one.per_m > 0.0 else ""
-
-
 def pose_errors(estimate: Array, truth: Array, covariances: Array) -> tuple[Array, Array]:
     """Errors (n - 1, d) of all poses but the first, in their tangent spaces, and their covariances (n - 1, d, d).
 
@@ -223,8 +218,8 @@ def should_be(one: NoiseScale, over_confident: str = "") -> str:
     """Return what the configured sigmas of a group should be, for a person; ``over_confident`` as below."""
     if one.reason:
         return f"not known: {one.reason}"
-    why = _not_smaller(one, over_confident)
-    return f"not smaller{_growth(one)}: {why}" if why else f"{one.factor:.3g} times as large{_growth(one)}"
+    why, grows = _not_smaller(one, over_confident), ", more in motion" * (one.per_rad > 0.0 or one.per_m > 0.0)
+    return f"not smaller{grows}: {why}" if why else f"{one.factor:.3g} times as large{grows}"
 
 
 def noise_advice(

@@ -281,36 +281,22 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     chosen = np.flatnonzero(s.named(path_ns))
     if not len(chosen):
         return
-    times = np.bincount(s.name[chosen])
-    seldom = float((times[times > 0] < _SELDOM).mean())
+    order = chosen[np.lexsort((s.stamp_ns[chosen], s.name[chosen]))]
+    is_same = np.diff(s.name[order]) == 0
+    first, last = (np.flatnonzero(np.concatenate(ends)) for ends in (([True], ~is_same), (~is_same, [True])))
+    seldom = float((last - first + 1 < _SELDOM).mean())
     if seldom > _MOST:
-        text = f"{seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
+        text = f"{seldom:.0%} of {len(first)} ids are seen less than {_SELDOM} times"
         yield s.finding("seen_once", "warning", seldom, _MOST, "part", text)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
-    seconds = (path_ns - path_ns[0]) * 1e-9
-    reach_m, few, comes_back = seen_over(s, chosen, path_ns[0], seconds, driven)
+    seconds, at_s = ((stamp_ns - path_ns[0]) * 1e-9 for stamp_ns in (path_ns, s.stamp_ns[order]))
+    at_m = np.interp(at_s, seconds, driven)
+    comes_back = (is_same & (np.diff(at_s) > _AGAIN_S) & (np.diff(at_m) > _AGAIN_M)).any()
+    few = min(int(_CHANCE * len(first)), _MOST_BY_CHANCE)  # where all ids change now and then, some come back before
+    reach_m = float(np.sort(at_m[last] - at_m[first])[-1 - few])
     least_m = float((_LOOP if comes_back else _SPAN) * driven[-1])
     if reach_m < least_m and driven[-1] > _AGAIN_M:
         again = "nothing joins its parts that are farther apart" if comes_back else "no landmark is seen again later"
         each = f"each landmark but {few}" if few else "each landmark"
         text = f"{each} is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m: {again}"
         yield s.finding("no_closure", "warning", reach_m, least_m, "m", text)
-
-
-def seen_over(
-    s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array
-) -> tuple[float, int, bool]:
-    """Return the longest way over which a landmark is seen, without how many, and whether one is seen again later.
-
-    One or two of a hundred do not join a drive: where all ids change now and then, a few come back before that.
-    """
-    t = (s.stamp_ns[chosen] - first_ns) * 1e-9
-    at_m = np.interp(t, seconds, driven)
-    order = np.lexsort((t, s.name[chosen]))
-    name, t, at_m = s.name[chosen][order], t[order], at_m[order]
-    same = name[1:] == name[:-1]
-    comes_back = (same & (np.diff(t) > _AGAIN_S) & (np.diff(at_m) > _AGAIN_M)).any()
-    begins = np.concatenate([[True], ~same])
-    ends = np.concatenate([~same, [True]])
-    few = min(int(_CHANCE * begins.sum()), _MOST_BY_CHANCE)
-    return float(np.sort(at_m[ends] - at_m[begins])[-1 - few]), few, bool(comes_back)

@@ -40,7 +40,6 @@ _LIMITS = {
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT = 2.0, 6.0**0.5  # sigmas: wheels that slip now and then are no fault
 _OF_A_BREAK = ("ids_unsure", "map_breaks", "landmark_moved")  # a robot that was carried has them with right ids
-_MOST, _SHIFTS = 0.9, 2.0  # part of the sightings that a clock moves by less; times that, between two places
 _LEAST_M, _LEAST_RAD, _PART, _SLIP_SIGMAS = 0.15, 0.3, 0.1, 6.0  # of a slip; _PART: of the way
 _LARGE_M, _LARGE_RAD, _LARGE_SIGMAS = 0.5, 0.8, 2.0 * _SLIP_SIGMAS  # of one that is no note
 
@@ -64,11 +63,11 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
     return slam
 
 
-def _points_in_map(c: Columns, s: SightingColumns, view: MapView, stamp_ns: Index) -> Array:
-    """(k, 3) Where each sighting puts its landmark, by the estimate at these stamps, corrected between keyframes."""
+def _points_in_map(c: Columns, s: SightingColumns, view: MapView) -> Array:
+    """(k, 3) Where each sighting puts its landmark, by the estimate at its stamp, corrected between keyframes."""
     order = np.argsort(view.keyframes.stamps_ns, kind="stable")
     estimate, own = (se3.in_space(poses).reshape(-1, 7)[order] for poses in (view.trajectory(), view.keyframes.poses))
-    at_ns, stamp_ns = view.keyframes.stamps_ns[order], np.clip(stamp_ns, c.path_ns[0], c.path_ns[-1])
+    at_ns, stamp_ns = view.keyframes.stamps_ns[order], np.clip(s.stamp_ns, c.path_ns[0], c.path_ns[-1])
     driven = poses_at(stamp_ns, c.path_ns, c.path)
     own[:, :3] *= c.config.odometry.distance_factor
     after = np.clip(np.searchsorted(at_ns, stamp_ns), 1, len(at_ns) - 1)
@@ -89,15 +88,13 @@ def check_trial(c: Columns, view: MapView) -> Iterator[Finding]:
     except GraphSlamError as error:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
-    clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
     unsure = answers.unsure(fit)
-    late_s = {} if unsure else {one.parameter.source: one.value for one in clocks}
     step_s = float(np.median(np.diff(c.path_ns))) * 1e-9
     off = {one.parameter: one.value for one in fitted if _is_far_off(fit, one, step_s)}
     slip = None if off else check_slips(c, view)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
     goes_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
-    found = [] if off or goes_back else _places(c, view, late_s, slip if is_broken else None)
+    found = [] if off or goes_back else _places(c, view, slip if is_broken else None)
     if unsure is not None:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(c, s))]
         why, value, limit, unit = unsure
@@ -182,26 +179,18 @@ def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
             yield topic.finding(one.code, "warning", one.value, limit, unit, one.text)
 
 
-def _places(c: Columns, view: MapView, late_s: Mapping[str, float], slip: tuple[Finding, int] | None) -> list[Finding]:
-    """Identities by where the estimate puts them, and sightings that are far from their landmark.
-
-    Stamps are corrected by what inputs are late, and sightings within a slip are left out.
-    """
+def _places(c: Columns, view: MapView, slip: tuple[Finding, int] | None) -> list[Finding]:
+    """Identities by where the estimate puts them, and sightings that are far from their landmark, but for a slip's."""
     found: list[Finding] = []
     for s in c.sightings:
-        late = round(late_s.get(s.input, 0.0) * 1e9)
-        inside = (s.stamp_ns + late >= c.path_ns[0]) & (s.stamp_ns + late <= c.path_ns[-1])
+        inside = (s.stamp_ns >= c.path_ns[0]) & (s.stamp_ns <= c.path_ns[-1])
         if slip is not None:
             inside &= (s.stamp_ns < slip[0].first_ns) | (s.stamp_ns > slip[1])
         if not inside.any():
             continue
-        before, points = (_points_in_map(c, s, view, stamp_ns) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
+        points = _points_in_map(c, s, view)
         points[~inside] = np.nan
         two = at_two_places(s, points, c.path_ns, c.config.world.dimensions)
-        shift = np.linalg.norm(points - before, axis=1)
-        shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point
-        shift_m = float(np.quantile(shift, _MOST)) if len(shift) else 0.0
-        two = [one for one in two if one.apart_m > _SHIFTS * shift_m]
         found += [*check_moved(s, two), *check_reused(s, two)]
         found += check_outliers(s, points, inside, c.config.world.dimensions)
     return found
