@@ -82,7 +82,7 @@ OF_A_REPLAY: tuple[Check, ...] = (check_times, check_frames, check_odometry, che
 """Those that a replay does by itself; its own table has the refusals."""
 
 _FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read later does not make it right
-_IN_OUTCOME = ("not_planar", "no_landmarks")
+_IN_OUTCOME = ("out_of_plane", "no_landmarks")
 _OF_POSE = ("no_orientation_of_odometry", "pose_stands")
 _WHILE_DRIVING = (*_FROM_THE_BEGINNING, "clock_domains", "constant_stamps", *_OF_POSE, "noise_zero")
 _OF_TWIST = ("twist_scale", "twist_frame", "twist_unrelated", "covariance_tiny", "covariance_useless")

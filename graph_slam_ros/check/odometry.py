@@ -1,6 +1,6 @@
 """Checks of odometry alone: whether it moves, jumps, leaves the plane, and agrees with its twist."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -14,7 +14,6 @@ from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.odometry import UNUSED
-from graph_slam_ros.messages.inputs.source import LEVEL_M
 from graph_slam_ros.typing import Array, Mask
 
 LEAST = 10
@@ -39,7 +38,7 @@ _AT_REST = 0.05  # of the root mean square
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02  # sideways by ahead; of what is left, and that
 _TINY, _USELESS, _SLOWEST_M_S = 1e-3, 3.0, 0.05  # sigmas by the fastest speed, and what that is at least
 _TINY_RAD_S = 1e-4  # no wheels are so good
-_OFF_PLANE = 0.05  # part of the poses
+_OUT_OF_PLANE = 0.05  # of all poses: with more, the robot does not move in a plane
 TOGETHER = 5
 """Steps that are summed for a slip."""
 _ROUNDS = 10  # of reweighting
@@ -52,7 +51,7 @@ _UNITS = {
     1000.0: "metres for thousands",
     1e-3: "millimetres for metres",
 }
-_DENSITY, _SPACE = ("odometry.noise=density",), ("world.dimensions=3",)
+_DENSITY = ("odometry.noise=density",)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +214,8 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = "it rolls, and never turns: does w come first in its quaternions?" if w_first else text
         yield o.finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text)
         return
-    yield from _plane(c, c.odometry)
+    counted = c.counters.as_dict().get(o.input, {})
+    yield from leaves_plane(o.input, counted, len(c.odometry.poses), o.topic)
     if c.config.odometry.noise == "density":
         return
     if np.isfinite(o.twist).all() and o.twist.any():
@@ -263,12 +263,12 @@ def _jumps(steps: Steps, jumps: Mask, max_speed_m_s: float) -> Iterator[Finding]
         yield steps.of.finding(code, "warning", count, 0, "times", text, at=at, settings=settings)
 
 
-def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
-    out = c.counters[o.input, "out_of_plane"]
-    share = out / len(o.poses)
-    if share > _OFF_PLANE and c.config.world.dimensions == 2:
-        text = f"{share:.0%} of the poses are more than {LEVEL_M} m above or below the first, or tilted"
-        yield o.finding("not_planar", "warning", share, _OFF_PLANE, "part", text, out, settings=_SPACE)
+def leaves_plane(name: str, counted: Mapping[str, int], received: int, topic: str = "") -> Iterator[Finding]:
+    """Yield that an odometry is not of a plane, if many of its poses are outside."""
+    if (out := counted.get("out_of_plane", 0)) > _OUT_OF_PLANE * received:
+        text, settings = f"{name} leaves the plane: these are three dimensions", ("world.dimensions=3",)
+        part = out / max(received, 1), _OUT_OF_PLANE, "part"
+        yield Finding("out_of_plane", "error", *part, text, topic, count=out, settings=settings, source=name)
 
 
 def _twist(steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:

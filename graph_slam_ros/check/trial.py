@@ -21,6 +21,7 @@ from graph_slam_ros.slam.calibration import answers
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.frontend.gyro import GyroState
+from graph_slam_ros.slam.levels import SIGMAS
 from graph_slam_ros.slam.noise.scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
@@ -147,7 +148,7 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
 def _is_far_off(fit: TrialFit, one: answers.Fitted, step_s: float) -> bool:
     """Return whether a parameter is far off by its limit and several sigmas. Between two poses a clock is no proof."""
     limit = max(_LIMITS.get(one.parameter.name, ("", np.inf))[1], _OF_STEP * step_s * (one.parameter.name == "clock"))
-    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else answers.SIGMAS
+    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else SIGMAS
     return answers.is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 
 

@@ -249,7 +249,6 @@ CHECKED: dict[str, Row] = {
     "odometry_jumps": _checked("correct the driver; a run begins a segment above odometry.max_speed_m_s"),
     "odometry_reset": _checked("cut the recording there"),
     "corrected": _checked(_WHEELS),
-    "not_planar": _checked(_SPACE),
     "twist_scale": _checked(_DENSITY),
     "twist_frame": _checked(_DENSITY),
     "twist_unrelated": _checked(_DENSITY),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 
+from graph_slam_ros.check.odometry import leaves_plane
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.findings.finding import Finding, Severity, causes
 from graph_slam_ros.findings.table import DOUBTS, explain
@@ -17,7 +18,7 @@ from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
 from graph_slam_ros.node.events import Outcome
-from graph_slam_ros.runs.outcome import MOTION, leaves_plane
+from graph_slam_ros.runs.outcome import MOTION
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them

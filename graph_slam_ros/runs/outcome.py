@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
+from graph_slam_ros.check.odometry import leaves_plane
 from graph_slam_ros.findings.finding import Finding, in_order
 from graph_slam_ros.findings.table import DOUBTS, OF_STAMPS, Effect, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
@@ -19,7 +20,6 @@ Summary = Mapping[str, Any]
 
 _WIDTH, _COLUMN = 100, 14
 _MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
-_OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
 MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
@@ -279,13 +279,6 @@ def contradicted(name: str, accepted: int, count: int) -> Iterator[Finding]:
     elif accepted < (1.0 - _DOUBTED) * count:
         text = f"{name}: {100.0 * (1.0 - accepted / count):.0f} % of {count} are not believed"
         yield Finding("contradicted", "warning", text=text, source=name)
-
-
-def leaves_plane(name: str, counted: Mapping[str, int], received: int) -> Iterator[Finding]:
-    """Yield that an odometry is not of a plane, if many of its poses are outside."""
-    if counted.get("out_of_plane", 0) > _OUT_OF_PLANE * received:
-        text, settings = f"{name} leaves the plane: these are three dimensions", ("world.dimensions=3",)
-        yield Finding("out_of_plane", "error", text=text, settings=settings, source=name)
 
 
 def _of_counters(summary: Summary) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into 
 _ORIENTATION_KNOWN_RAD2 = 0.5**2  # a heading of a larger variance is none: beyond, a residual is not linear
 _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading
 _LITTLE = 0.1  # of a quaternion's x and y: a robot that leans less is upright
-LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
+_LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
 
 
 @dataclass(slots=True)
@@ -214,7 +214,7 @@ class InputContext:
         """A pose of the robot. In the plane it is counted if it leaves the plane of the first one."""
         if self.space.dimensions == 2:
             up = so3.act(se3.rotation(T), (0.0, 0.0, 1.0))
-            if abs(T[2] - self.state.setdefault("height", T[2])) > LEVEL_M or up[2] < _UPRIGHT:
+            if abs(T[2] - self.state.setdefault("height", T[2])) > _LEVEL_M or up[2] < _UPRIGHT:
                 self.count("out_of_plane")
         return self.projected(T)
 
@@ -226,7 +226,7 @@ class InputContext:
         if height is None:
             return []
         x, y, z, qx, qy, qz, qw = numbers.T
-        count = _first_false(are_wanted & (abs(z - height) <= LEVEL_M) & (abs(qx) + abs(qy) <= _LITTLE))
+        count = _first_false(are_wanted & (abs(z - height) <= _LEVEL_M) & (abs(qx) + abs(qy) <= _LITTLE))
         ahead = so3.act((qx[:count], qy[:count], qz[:count], qw[:count]), (1.0, 0.0, 0.0))
         headings = map(math.atan2, ahead[1].tolist(), ahead[0].tolist())
         return list(zip(x[:count].tolist(), y[:count].tolist(), headings, strict=True))

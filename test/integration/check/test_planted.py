@@ -59,7 +59,7 @@ def at(mount):
 
 PLANTED = {name: (FAULTS[name][0], FAULTS[name][1].split(), {}) for name in SELECTED} | {
     "half of the landmarks without identity": (half_unnamed, ["no_id"], {}),
-    "a ramp": (ramp, ["not_planar"], {"world.dimensions": 2}),
+    "a ramp": (ramp, ["out_of_plane"], {"world.dimensions": 2}),
     "odometry without orientation": (unturned, ["no_orientation_of_odometry"], {}),
     "a twist of noise": (shaken, ["twist_unrelated"], {}),
     "a transform inverted": (of("wrong_mount:yaw_deg=68.755,x_m=0.5"), ["axes"], at("-0.181 0.466 0 0 0 -1.2")),
