@@ -16,7 +16,7 @@ from graph_slam_ros.optimization import Solution
 from graph_slam_ros.slam.landmarks.rotations import aligned
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
-from graph_slam_ros.tools.certificate.synchronization import RELATIVE, Edges, Poses, Synchronization
+from graph_slam_ros.tools.certificate.synchronization import RELATIVE, Poses, Synchronization
 from graph_slam_ros.typing import Array
 
 CERTIFIED, NOT_CERTIFIED, DOES_NOT_APPLY = "certified", "not certified", "does not apply"
@@ -86,7 +86,7 @@ class Certificate:
 def certify(solution: Solution) -> Certificate:
     """Certify that a solved graph of relative poses is at the global optimum.
 
-    The certificate belongs to SE-Sync's cost, which is chordal and isotropic (``Edges.precisions``). So its critical
+    The certificate belongs to SE-Sync's cost, which is chordal and isotropic (``precisions``). So its critical
     point near the estimate is found (``polish``) and certified: where ``S = Q - Lambda`` has no negative eigenvalue, by
     duality no poses have a lower cost (Rosen et al. 2019, Carlone et al. 2015, 2016). That the estimate is this point,
     but for the difference of the two costs, is told by their distance.
@@ -100,14 +100,13 @@ def certify(solution: Solution) -> Certificate:
     graph = solution.file.graph
     if reason := _no_relative_poses(graph):
         return Certificate(DOES_NOT_APPLY, reason)
-    edges, anchors = Edges.of(graph), _anchors(solution)
-    if reason := _ill_fitting(solution, edges, anchors):
+    problem, anchors = Synchronization.of(graph), _anchors(solution)
+    if reason := _ill_fitting(solution, problem, anchors):
         return Certificate(DOES_NOT_APPLY, reason)
     root = anchors[0] if anchors else int(np.argmin(solution.file.ids))
     estimate = solution.solver.estimate(np.arange(graph.vertex_count))
     here = Poses.of(estimate)
     here = Poses(here.rotations, here.positions - here.positions[root])  # maps far from their origin lose digits
-    problem = Synchronization.of(edges, graph.vertex_count)
     there = polish(problem, here, root)
     d, n = problem.dimensions, problem.poses
     rounding = _ROUNDING * float(problem.data_matrix().diagonal()[n:].max())
@@ -132,7 +131,7 @@ def certify(solution: Solution) -> Certificate:
         there.cost,
         bound,
         solution.report.chi2_final,
-        bound * edges.least_share(),
+        bound * problem.least_share(),
         float(distance.max()),
         float(np.sqrt((distance**2).mean())),
         sigmas,
@@ -164,10 +163,10 @@ def _anchors(solution: Solution) -> list[int]:
     return out
 
 
-def _ill_fitting(solution: Solution, edges: Edges, anchors: list[int]) -> str:
+def _ill_fitting(solution: Solution, problem: Synchronization, anchors: list[int]) -> str:
     """The reason why SE-Sync's cost is far from what was minimised, or an empty string."""
-    report, n = solution.report, solution.file.graph.vertex_count
-    links = coo_array((np.ones(len(edges.ends)), tuple(edges.ends.T)), shape=(n, n))
+    report, n = solution.report, problem.poses
+    links = coo_array((np.ones(len(problem.ends)), tuple(problem.ends.T)), shape=(n, n))
     parts, _ = connected_components(links, directed=False)
     if parts > 1:
         return f"the relative poses leave the graph in {parts} parts"
@@ -175,10 +174,10 @@ def _ill_fitting(solution: Solution, edges: Edges, anchors: list[int]) -> str:
         return f"the graph has {len(anchors)} anchors (FIX lines and priors): relative poses may have one"
     if abs(report.cost_final - report.chi2_final) > _SAME * report.chi2_final:
         return "a robust loss was minimised"
-    ratio = edges.anisotropy()
+    ratio = problem.anisotropy()
     beyond = int(np.count_nonzero(ratio > _MOST_ANISOTROPY))
     if beyond:
-        i, j = (solution.file.ids[v] for v in edges.ends[ratio.argmax()].tolist())
+        i, j = (solution.file.ids[v] for v in problem.ends[ratio.argmax()].tolist())
         return (
             f"{beyond} of {len(ratio)} edges have anisotropic translations (information up to {ratio.max():.3g} to 1,"
             f" between vertices {i} and {j}; up to {_MOST_ANISOTROPY:g} counts as isotropic)"

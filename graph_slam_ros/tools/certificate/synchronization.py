@@ -21,75 +21,6 @@ RELATIVE = (RELATIVE_POSE, INVERSE_RELATIVE_POSE, RELATIVE_POSE_3D)
 
 
 @dataclass(frozen=True, slots=True)
-class Edges:
-    """The relative poses of a graph that have a weight, as they stand in it: m edges, p numbers in a residual.
-
-    Attributes
-    ----------
-    ends : (m, 2) vertices
-    measured : (m, 3) or (m, 7)
-    information : (m, p, p), times the weights
-    """
-
-    ends: Index
-    measured: Array
-    information: Array
-
-    @classmethod
-    def of(cls, graph: Graph) -> "Edges":
-        """Collect the relative poses of a graph whose poses are all of one kind."""
-        parts = []
-        for table in (graph.tables[edge] for edge in RELATIVE if edge in graph.tables):
-            rows = np.flatnonzero(table.weight.values)
-            if not len(rows):
-                continue
-            some = table.at(rows)
-            root = some.sqrt_information
-            information = (np.swapaxes(root, 1, 2) @ root) * some.weight[:, None, None]
-            parts.append((some.vertices, some.measured, information))
-        if not parts:
-            return cls(np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-    @property
-    def dimensions(self) -> int:
-        """The dimensions of the space that the poses are in: 2 or 3."""
-        return 2 if self.information.shape[1] == 3 else 3
-
-    def anisotropy(self) -> Array:
-        """Largest over smallest eigenvalue of each translation's information, (m,)."""
-        d = self.dimensions
-        values = np.linalg.eigvalsh(self.information[:, :d, :d])
-        return np.asarray(values[:, -1] / values[:, 0])
-
-    def precisions(self) -> tuple[Array, Array]:
-        """``kappa`` and ``tau`` (m,): the isotropic precisions of rotation and translation.
-
-        They come from the traces of the covariances, as SE-Sync takes them from graphs in space: ``tau = d / tr``, and
-        ``kappa = p / (2 tr)`` with p the degrees of freedom of a rotation, that of the isotropic Langevin distribution
-        nearest to the Gaussian one. Then F and chi2 agree to second order, as |R - 1|^2 is twice the angle squared.
-        (Its reader of graphs in the plane has twice that kappa.)
-        """
-        d = self.dimensions
-        of_translation, of_rotation = self.information[:, :d, :d], self.information[:, d:, d:]
-        tau = d / np.trace(np.linalg.inv(of_translation), axis1=1, axis2=2)
-        kappa = 0.5 * of_rotation.shape[1] / np.trace(np.linalg.inv(of_rotation), axis1=1, axis2=2)
-        return kappa, tau
-
-    def least_share(self) -> float:
-        """The largest c such that chi2 >= c F at all poses: 1 where all noise is isotropic, in space and in the plane.
-
-        An angle squared is at least half of |R - 1|^2, so it is where each information is at least c times the
-        isotropic one: c is the smallest eigenvalue of the one relative to the other.
-        """
-        kappa, tau = self.precisions()
-        d, size = self.dimensions, self.information.shape[1]
-        root = np.sqrt(np.where(np.arange(size) < d, tau[:, None], 2.0 * kappa[:, None]))
-        relative = self.information / root[:, :, None] / root[:, None, :]
-        return float(np.linalg.eigvalsh(relative)[:, 0].min())
-
-
-@dataclass(frozen=True, slots=True)
 class Poses:
     """Rotations (n, d, d) and positions (n, d)."""
 
@@ -112,30 +43,59 @@ class Poses:
 
 @dataclass(frozen=True)
 class Synchronization:
-    """SE-Sync's problem on n poses that m edges join.
+    """SE-Sync's problem on n poses that m edges join: the relative poses of a graph that have a weight.
 
     Attributes
     ----------
+    poses : n
     ends : (m, 2) which poses
     measured : rotations and positions of the edges
-    kappa, tau : (m,) precisions of rotation and translation
+    information : (m, p, p) of each, times its weight
+    kappa, tau : (m,) precisions of rotation and translation, see ``precisions``
     """
 
     poses: int
     ends: Index
     measured: Poses
+    information: Array
     kappa: Array
     tau: Array
 
     @classmethod
-    def of(cls, edges: Edges, poses: int) -> "Synchronization":
-        """Make the problem with the isotropic precisions of some edges."""
-        return cls(poses, edges.ends, Poses.of(edges.measured), *edges.precisions())
+    def of(cls, graph: Graph) -> "Synchronization":
+        """Make the problem of a graph whose poses are all of one kind, and which has relative poses."""
+        ends, measured, information = [], [], []
+        for table in (graph.tables[edge] for edge in RELATIVE if edge in graph.tables):
+            some = table.at(np.flatnonzero(table.weight.values))
+            root = some.sqrt_information
+            ends.append(some.vertices)
+            measured.append(some.measured)
+            information.append((np.swapaxes(root, 1, 2) @ root) * some.weight[:, None, None])
+        of_all = np.concatenate(information)
+        poses = Poses.of(np.concatenate(measured))
+        return cls(graph.vertex_count, np.concatenate(ends), poses, of_all, *precisions(of_all))
 
     @property
     def dimensions(self) -> int:
         """The dimensions of the space that the poses are in: 2 or 3."""
         return int(self.measured.positions.shape[1])
+
+    def anisotropy(self) -> Array:
+        """Largest over smallest eigenvalue of each translation's information, (m,)."""
+        d = self.dimensions
+        values = np.linalg.eigvalsh(self.information[:, :d, :d])
+        return np.asarray(values[:, -1] / values[:, 0])
+
+    def least_share(self) -> float:
+        """The largest c such that chi2 >= c F at all poses: 1 where all noise is isotropic, in space and in the plane.
+
+        An angle squared is at least half of |R - 1|^2, so it is where each information is at least c times the
+        isotropic one: c is the smallest eigenvalue of the one relative to the other.
+        """
+        d, size = self.dimensions, self.information.shape[1]
+        root = np.sqrt(np.where(np.arange(size) < d, self.tau[:, None], 2.0 * self.kappa[:, None]))
+        relative = self.information / root[:, :, None] / root[:, None, :]
+        return float(np.linalg.eigvalsh(relative)[:, 0].min())
 
     @cached_property
     def root(self) -> csc_array:
@@ -231,6 +191,21 @@ class Synchronization:
         turned = x.rotations @ (np.eye(d) + np.einsum("kab,ik->iab", g, steps[:, d:]))
         u, _, vt = np.linalg.svd(turned)
         return Poses(u @ vt, x.positions + steps[:, :d])
+
+
+def precisions(information: Array) -> tuple[Array, Array]:
+    """``kappa`` and ``tau`` (m,): the isotropic precisions of rotation and translation.
+
+    They come from the traces of the covariances, as SE-Sync takes them from graphs in space: ``tau = d / tr``, and
+    ``kappa = p / (2 tr)`` with p the degrees of freedom of a rotation, that of the isotropic Langevin distribution
+    nearest to the Gaussian one. Then F and chi2 agree to second order, as |R - 1|^2 is twice the angle squared.
+    (Its reader of graphs in the plane has twice that kappa.)
+    """
+    d = 2 if information.shape[1] == 3 else 3
+    of_translation, of_rotation = information[:, :d, :d], information[:, d:, d:]
+    tau = d / np.trace(np.linalg.inv(of_translation), axis1=1, axis2=2)
+    kappa = 0.5 * of_rotation.shape[1] / np.trace(np.linalg.inv(of_rotation), axis1=1, axis2=2)
+    return kappa, tau
 
 
 def generators(dimensions: int) -> Array:

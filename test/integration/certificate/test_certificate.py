@@ -29,7 +29,7 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.solver import Settings
 from graph_slam_ros.tools.certificate import CERTIFIED, DOES_NOT_APPLY, NOT_CERTIFIED
 from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
-from graph_slam_ros.tools.certificate.synchronization import Edges, Poses, Synchronization
+from graph_slam_ros.tools.certificate.synchronization import Poses, Synchronization
 
 GRAPHS = DATASETS / "pose_graphs"
 public = pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
@@ -85,7 +85,7 @@ def dense_certificate(problem, x):
 def test_the_eigenvalue_is_that_of_the_dense_matrix_whichever_position_is_left_out(world):
     for made, sign in ((random_graph, 0.0), (ring, -1.0)):  # optimal, and wrapped wrongly
         graph = made(world, 2.0)
-        problem = Synchronization.of(Edges.of(graph), graph.vertex_count)
+        problem = Synchronization.of(graph)
         there = polish(problem, Poses.of(graph.initial.values.reshape(graph.vertex_count, -1)), 0).poses
         dense = np.linalg.eigvalsh(dense_certificate(problem, there))
         scale = problem.data_matrix().diagonal().max()
@@ -228,8 +228,7 @@ def test_half_the_rotation_vector_and_g2os_half_sine_have_optima_of_their_own(st
 def test_public_graphs_come_to_the_optimal_value_in_se_syncs_weights(name, optimal):
     """These weights count rotations twice in the plane: Rosen et al. 2019 in space; those in the plane are proved."""
     solution = optimize(read_g2o(GRAPHS / f"{name}.g2o", raw=True), init="chordal")
-    graph = solution.file.graph
-    problem = Synchronization.of(Edges.of(graph), graph.vertex_count)
+    problem = Synchronization.of(solution.file.graph)
     if problem.dimensions == 2:
         problem = replace(problem, kappa=2.0 * problem.kappa)
     there = polish(problem, Poses.of(solution.poses), 0)
