@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -78,16 +79,16 @@ def _weak_text(weakness: "Weakness", advisor: "Advisor") -> Iterator[str]:
     unseen = weakness.longest_unseen()
     yield "weak stretches" if stretches or unseen else "weak stretches: none"
     for stretch in stretches:
-        numbers = f"sigma up to {_sigma(stretch.what, stretch.sigma)}, median {_sigma(stretch.what, stretch.usual)}"
-        yield f"  {stretch.what} weak for {_span(stretch)}: {stretch.reason}; {numbers}"
+        sigma, usual = (_sigma(stretch.what, x or 0.0) for x in (stretch.sigma, stretch.usual))
+        yield f"  {stretch.what} weak for {_span(stretch)}: {stretch.reason}; sigma up to {sigma}, median {usual}"
     if unseen:
         yield f"  {unseen.reason} for {_span(unseen)}: the longest part of the path without one"
 
 
 def _span(one: "Stretch") -> str:
-    stamps = f"{one.begins_ns * 1e-9:.3f} to {one.ends_ns * 1e-9:.3f} s"
+    (first, last), (begins_s, ends_s) = one.keyframes, (stamp_ns * 1e-9 for stamp_ns in one.stamps_ns)
     return (
-        f"{one.length_m:.1f} m (keyframes {one.first} to {one.last}, {stamps},"
+        f"{one.length_m:.1f} m (keyframes {first} to {last}, {begins_s:.3f} to {ends_s:.3f} s,"
         f" {one.begins_m:.1f} to {one.begins_m + one.length_m:.1f} m driven)"
     )
 
@@ -138,23 +139,10 @@ def _as_dict(
             for one, some in zip(advisor.weakest, found, strict=True)
         ],
         "best_for_path": _advice_as_dict(of_path) if of_path else None,
-        "stretches": [_stretch_as_dict(one) for one in (*stretches, *([unseen] if unseen else []))],
+        "stretches": [asdict(one) for one in (*stretches, *([unseen] if unseen else []))],
     }
 
 
 def _advice_as_dict(one: "Advice") -> dict[str, Any]:
     kind, about = one.addition.kind, one.addition.about
     return {"kind": kind, "about": about, "path_now_m": one.path_now_m, "path_m": one.path_m}
-
-
-def _stretch_as_dict(one: "Stretch") -> dict[str, Any]:
-    return {
-        "what": one.what or "sightings",
-        "keyframes": [one.first, one.last],
-        "stamps_ns": [one.begins_ns, one.ends_ns],
-        "begins_m": one.begins_m,
-        "length_m": one.length_m,
-        "sigma": one.sigma if one.what else None,
-        "usual": one.usual if one.what else None,
-        "reason": one.reason,
-    }

@@ -16,7 +16,7 @@ from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Array, Numbers
 
-POSITION, HEADING, LANDMARK = "position", "heading", "landmark"
+POSITION, HEADING, LANDMARK, SIGHTINGS = "position", "heading", "landmark", "sightings"
 _WEAK = 1.5  # of the usual sigma, the median of the run
 _SHOWN = 3  # stretches of each quantity
 _MOSTLY, _FEW = 0.5, 0.5  # of the length of a stretch; sightings for each keyframe
@@ -54,23 +54,21 @@ class Stretch:
 
     Attributes
     ----------
-    what : ``position`` or ``heading``; empty: only no landmark was seen
-    first, last : keyframes, by their numbers
-    begins_ns, ends_ns : their stamps
+    what : ``position`` or ``heading``; ``sightings``: only no landmark was seen
+    keyframes : the first and the last, by their numbers
+    stamps_ns : of both
     begins_m, length_m : the way driven until the first, and from there to the last
-    sigma, usual : the largest sigma in it, and the median of the run [m or rad]
+    sigma, usual : the largest sigma in it, and the median of the run [m or rad]; None of sightings
     reason : why it is weak, in words
     """
 
     what: str
-    first: int
-    last: int
-    begins_ns: int
-    ends_ns: int
+    keyframes: tuple[int, int]
+    stamps_ns: tuple[int, int]
     begins_m: float
     length_m: float
-    sigma: float
-    usual: float
+    sigma: float | None
+    usual: float | None
     reason: str
 
 
@@ -200,7 +198,7 @@ class Weakness:
                 for a, b in _runs(sigmas > _WEAK * usual)
             ]
             long = [one for one in found if one.length_m >= _LEAST_M]
-            yield from sorted(long, key=lambda one: -one.sigma)[:_SHOWN]
+            yield from sorted(long, key=lambda one: -(one.sigma or 0.0))[:_SHOWN]
 
     def longest_unseen(self) -> Stretch | None:
         """The longest part of the path without an accepted sighting; None where the run has no landmark.
@@ -214,16 +212,18 @@ class Weakness:
         longest = max(unseen, key=lambda one: self._length(*one), default=None)
         if longest is None or self._length(*longest) < _LEAST_M:
             return None
-        return self._stretch("", *longest, 0.0, 0.0)
+        return self._stretch(SIGHTINGS, *longest)
 
     def _length(self, first: int, last: int) -> float:
         return float(self.travelled_m[last] - self.travelled_m[first])
 
-    def _stretch(self, what: str, first: int, last: int, sigma: float, usual: float) -> Stretch:
-        stamps_ns = self.run.stamps_ns
-        reason = self._reason(first, last) if what else "no landmark seen"
-        at = self.run.numbers[first], self.run.numbers[last], stamps_ns[first], stamps_ns[last]
-        return Stretch(what, *at, float(self.travelled_m[first]), self._length(first, last), sigma, usual, reason)
+    def _stretch(
+        self, what: str, first: int, last: int, sigma: float | None = None, usual: float | None = None
+    ) -> Stretch:
+        numbers, stamps_ns = ((of[first], of[last]) for of in (self.run.numbers, self.run.stamps_ns))
+        reason = "no landmark seen" if what == SIGHTINGS else self._reason(first, last)
+        begins_m = float(self.travelled_m[first])
+        return Stretch(what, numbers, stamps_ns, begins_m, self._length(first, last), sigma, usual, reason)
 
     def _reason(self, first: int, last: int) -> str:
         """Return the reason why a stretch is weak: what was seen in it, and what of that is known from elsewhere."""

@@ -83,11 +83,12 @@ def test_a_way_without_landmarks_is_named_with_its_length_and_stamps(straight, t
     unseen = weakness.longest_unseen()
     assert 38.0 < unseen.length_m < 42.0
     assert unseen.begins_m == pytest.approx(7.5, abs=1.0)
-    assert unseen.begins_ns == pytest.approx(10 * S + unseen.begins_m * S, abs=S)
+    assert unseen.stamps_ns[0] == pytest.approx(10 * S + unseen.begins_m * S, abs=S)
     code, out, err = told("advise", straight)
     assert (code, err) == (0, "")
     (line,) = [one for one in out.splitlines() if one.startswith("  no landmark seen for")]
-    assert f"no landmark seen for {unseen.length_m:.1f} m (keyframes {unseen.first} to {unseen.last}, " in line
+    first, last = unseen.keyframes
+    assert f"no landmark seen for {unseen.length_m:.1f} m (keyframes {first} to {last}, " in line
     assert "the anchor at the first keyframe" in out
     assert out.splitlines()[-1].startswith("next: ")
 
@@ -164,7 +165,7 @@ def test_of_a_drive_in_a_frozen_map_the_drive_is_advised_on(straight, tmp_path, 
     code, out, err = told("advise", tmp_path / "run")
     assert (code, err) == (0, "")
     assert "a frozen map" in out.splitlines()[0] and "survey landmark" not in out
-    assert Weakness(run).longest_unseen().first >= len(SavedGraph(straight, []).keyframes)
+    assert Weakness(run).longest_unseen().keyframes[0] >= len(SavedGraph(straight, []).keyframes)
 
 
 def test_what_cannot_be_advised_on_is_refused_in_one_line(straight, tmp_path, told):
