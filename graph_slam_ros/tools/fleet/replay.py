@@ -11,11 +11,12 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, as_completed
 
 from graph_slam_ros import __version__
 from graph_slam_ros.config import Config
@@ -178,36 +179,20 @@ def connected(scheduler: str, count: int) -> Iterator[Client]:
             _check_versions(client, scheduler)
         else:
             scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="graph_slam_dask_"))
-            cluster = LocalCluster(
-                n_workers=count or None,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                memory_limit=0,
-                local_directory=scratch,
-                silence_logs="CRITICAL",
-            )
-            stack.enter_context(cluster)
-            client = stack.enter_context(Client(cluster, set_as_default=False))
+            local: dict[str, Any] = {"n_workers": count or None, "threads_per_worker": 1, "processes": True}
+            local |= {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "memory_limit": 0}
+            local |= {"local_directory": scratch, "silence_logs": "CRITICAL"}
+            client = stack.enter_context(Client(set_as_default=False, **local))
         yield client
 
 
 def _check_versions(client: Client, address: str) -> None:
-    found = client.run(_version)
+    found = client.run(version, "graph_slam_ros", on_error="return")
     if not found:
         raise GraphSlamError(f"{address}: the scheduler has no worker: start some with dask worker {address}")
-    for worker, version in sorted(found.items()):
-        if version != __version__:
-            raise GraphSlamError(f"{worker}: has graph_slam_ros {version}, and this is {__version__}")
-
-
-def _version() -> str:
-    try:
-        from graph_slam_ros import __version__ as here
-    except ImportError:
-        return "not installed"
-    return here
+    for worker, there in sorted(found.items()):
+        if there != __version__:
+            raise GraphSlamError(f"{worker}: has graph_slam_ros {there}, and this is {__version__}")
 
 
 def run_isolated(job: Job) -> Row:
