@@ -278,7 +278,7 @@ def _chi2_histograms(saved: SavedGraph) -> Iterator[dict[str, Any]]:
 
 
 def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
-    odometry = keyframe_paths(out.run, saved)[1]
+    odometry = keyframe_paths(saved)[1]
     found = corrections(out.run, odometry.stamps_s, odometry.poses, out.losses)
     changed: dict[int, list[int]] = {}
     for change in saved.changes:
@@ -299,18 +299,18 @@ def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
 
 
 def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores | None, known: Truth | None) -> None:
-    config = out.attempt(lambda: run_config(out.run))
     edits = [one.edit for one in saved.edits] if saved else []
-    out.data["tables"] = {
-        "inputs": out.attempt(lambda: verdict.inputs(summary)) or [],
-        "input_columns": list(INPUT_COLUMNS.values()),
-        "configuration": out.attempt(lambda: verdict.configuration(config)) if config else [],
-        "versions": out.attempt(lambda: verdict.versions(out.run, summary)) or [],
-        "timing": out.attempt(lambda: verdict.timing(summary)) or [],
-        "noise": out.attempt(lambda: verdict.noise(summary, scores)) or [],
-        "edits": [[shown(str(e)) for e in (one.name, one.text, one.who, one.when, one.why)] for one in edits],
-        "classes": out.attempt(lambda: list(verdict.classes(summary))) or [],
+    made: dict[str, Callable[[], list[verdict.Row]]] = {
+        "inputs": lambda: verdict.inputs(summary),
+        "configuration": lambda: verdict.configuration(run_config(out.run)),
+        "versions": lambda: verdict.versions(out.run, summary),
+        "timing": lambda: verdict.timing(summary),
+        "noise": lambda: verdict.noise(summary, scores),
+        "edits": lambda: [[shown(str(e)) for e in (one.name, one.text, one.who, one.when, one.why)] for one in edits],
+        "classes": lambda: list(verdict.classes(summary)),
     }
+    out.data["tables"] = {name: out.attempt(table) or [] for name, table in made.items()}
+    out.data["tables"]["input_columns"] = list(INPUT_COLUMNS.values())
     out.data["load"] = out.attempt(lambda: verdict.load(summary))
     out.data["waiting"] = [[shown(str(n)), shown(str(why))] for n, why in dict(summary.get("waiting") or {}).items()]
     out.data["chi2_per_dof"] = out.attempt(lambda: verdict.chi2_per_dof(saved)) if saved else None

@@ -4,7 +4,6 @@ import base64
 import io
 import math
 import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,9 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_bytes, read_text
 from graph_slam_ros.lie import se3
-from graph_slam_ros.runs.folder import LANDMARKS, PATH, PATH_ODOMETRY
+from graph_slam_ros.runs.folder import LANDMARKS
 from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_landmarks, read_rows
 from graph_slam_ros.tools.report.packing import Packing, shown
-from graph_slam_ros.typing import Array
 
 MOST_KEYFRAMES, MOST_TRUTH = 20_000, 8_000  # of a path: more are thinned
 _MM = 1e-3
@@ -37,7 +35,7 @@ def paths(
 
     Raises GraphSlamError: a file that is missing or damaged.
     """
-    path, reckoned = keyframe_paths(run, saved)
+    path, reckoned = keyframe_paths(saved)
     T_map_odom = se3.compose(tuple(path.poses[0].tolist()), se3.inverse(tuple(reckoned.poses[0].tolist())))
     drawn = {"odometry": reckoned.moved(T_map_odom), "estimate": path}
     out: dict[str, Any] = {"keyframes": len(path.stamps_s), "stamps": pack.column(path.stamps_s, "f8")}
@@ -55,18 +53,11 @@ def paths(
     return out
 
 
-def keyframe_paths(run: Path, saved: SavedGraph) -> tuple[Trajectory, Trajectory]:
-    """The estimate and odometry at the keyframes: of the run's files, or of its map where they are not of that."""
+def keyframe_paths(saved: SavedGraph) -> tuple[Trajectory, Trajectory]:
+    """The estimate and odometry at the keyframes."""
     whole = saved.whole_path
-
-    def of(name: str, poses: Array) -> Trajectory:
-        with suppress(GraphSlamError):
-            path = read_rows(run / name)
-            if len(path.stamps_s) == len(whole.stamps_ns):
-                return path
-        return Trajectory(whole.stamps_ns / 1e9, se3.in_space(poses))
-
-    return of(PATH, whole.poses()), of(PATH_ODOMETRY, whole.odometry)
+    estimate, odometry = (Trajectory(whole.stamps_ns / 1e9, se3.in_space(of)) for of in (whole.poses(), whole.odometry))
+    return estimate, odometry
 
 
 def _known_landmarks(run: Path, saved: SavedGraph) -> LandmarkTable:

@@ -11,7 +11,7 @@ from graph_slam_ros import __version__
 from graph_slam_ros.analysis.consistency import should_be
 from graph_slam_ros.analysis.explain import inert_gates
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.config.config import Config, flatten, parameters
+from graph_slam_ros.config.config import Config, parameters
 from graph_slam_ros.findings.table import Effect, explain, remedy
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
@@ -20,7 +20,7 @@ from graph_slam_ros.tools.report.packing import shown
 
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
-_MOST_NEES, _NEARLY_ALL = 2.0, 0.9  # times what is expected; of the measurements
+_MOST_NEES = 2.0  # times what is expected
 _MOST_REASONS = 3  # that are named: of rejected measurements, and of what else is wrong
 
 
@@ -54,9 +54,6 @@ def verdict(
     doubts += list(scores.warnings) if scores is not None else []
     doubts += inert_gates(saved)
     doubts += _covariances(saved, scores)
-    judged = [e.is_in for e in saved.entries if e.verdict]
-    if sum(judged) < _NEARLY_ALL * len(judged):
-        doubts.append("more than a tenth of its measurements are not believed")
     first, *others = [*(one if one.endswith((".", "?")) else f"{one}." for one in (*short, *doubts)), ""]
     has_inputs = any(one["use"] for one in summary.get("inputs", {}).values())  # a graph's have no use
     fine = f"No measurement of this run speaks against this map: {_fit(saved)}."
@@ -145,13 +142,8 @@ def inputs(summary: Mapping[str, Any]) -> list[Row]:
 def configuration(config: Config) -> list[Row]:
     """The parameters that differ from their defaults: name, value, default, meaning."""
     known = {p.name: p for p in parameters(config.inputs.names.split())}
-    rows = []
-    for name, value in flatten(config.as_mapping()):
-        p = known.get(name)
-        if p is None or value != p.default:
-            default, meaning = (shown(str(p.default)), p.meaning) if p else ("", "")
-            rows.append([shown(name), shown(str(value)), default, meaning])
-    return rows
+    of = [(known[name], value) for name, value in config.differing.items()]
+    return [[shown(p.name), shown(str(value)), shown(str(p.default)), p.meaning] for p, value in of]
 
 
 def versions(run: Path, summary: Mapping[str, Any]) -> list[Row]:

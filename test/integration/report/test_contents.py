@@ -57,7 +57,6 @@ def test_the_sentences_on_top_say_what_is_out_and_what_to_do(made, run, saved):
     jumped = verdict.verdict(run, {}, saved, None, [], (7, 0.8))
     assert "map -> odom jumped by up to 0.80 m, at keyframe 7." in jumped
     assert "keyframes" in size and judged.startswith(f"{len(out)} of ")
-    assert ("more than a tenth" in " ".join(made.data["sentences"])) == (10 * len(out) > int(judged.split()[2]))
     tables = made.data["tables"]
     assert tables["input_columns"][:2] == ["messages received", "measurements used"]
     assert all(len(row) == len(tables["input_columns"]) + 4 for row in tables["inputs"])
