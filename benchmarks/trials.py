@@ -1,6 +1,5 @@
 """A graph with false measurements among the true ones: what robust solvers are tried on."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +12,7 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.slam import Sighting
 from graph_slam_ros.tools.simulation import Fault
 from graph_slam_ros.tools.simulation import false_closures as generator
-from graph_slam_ros.tools.simulation.draft import Draft
-from graph_slam_ros.tools.simulation.faults import put_faults
+from graph_slam_ros.tools.simulation.faults import Draft, put_faults
 
 ID_POLICIES = ("wrong_ids", "swapped_ids")
 POLICIES = (*generator.POLICIES, *ID_POLICIES)
@@ -36,12 +34,6 @@ class Trial:
     odometry: Problem
     closures: Edges
     false: NDArray[np.bool_]
-
-    def arrays(self) -> Iterator[Array]:
-        """All that a contender is given."""
-        yield from (self.odometry.poses, self.odometry.landmarks)
-        for edges in (self.odometry.relative, self.odometry.sightings, self.closures):
-            yield from (edges.ends, edges.measured, edges.root)
 
 
 def split(problem: Problem) -> tuple[Problem, Edges]:

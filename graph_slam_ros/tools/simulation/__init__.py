@@ -11,9 +11,17 @@ from typing import Any
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.tools.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.tools.simulation.bag import write_bag
-from graph_slam_ros.tools.simulation.draft import WrongLine, WrongMessage, write_table
 from graph_slam_ros.tools.simulation.drive import Drive
-from graph_slam_ros.tools.simulation.faults import KINDS, Fault, faulty_graph, faulty_recording, put_faults
+from graph_slam_ros.tools.simulation.faults import (
+    KINDS,
+    Fault,
+    WrongLine,
+    WrongMessage,
+    faulty_graph,
+    faulty_recording,
+    put_faults,
+    write_table,
+)
 from graph_slam_ros.tools.simulation.instruments import with_instruments
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, options_of

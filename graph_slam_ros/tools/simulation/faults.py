@@ -4,25 +4,29 @@ A fault is put into a ``Draft``, which lists what is wrong in it. The same seed 
 its own stream of random numbers, so that one more fault changes none of the others.
 """
 
+import csv
+import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.random import Generator
 
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
-from graph_slam_ros.formats.g2o_writer import graph_lines
+from graph_slam_ros.formats.g2o_writer import graph_lines, write_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam import Closure, Sighting
 from graph_slam_ros.tools.simulation import false_closures as generator
 from graph_slam_ros.tools.simulation.bag import ODOMETRY_TOPIC, recorded_names
-from graph_slam_ros.tools.simulation.draft import Draft, WrongLine, WrongMessage
 from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, option, options_of, random
@@ -34,11 +38,147 @@ from graph_slam_ros.tools.simulation.recording import (
     places,
     space_of,
 )
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Numbers
 
+Measured = Literal["odometry", "sighting", "closure"]
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault
 _STREAMS = 1  # the world itself is drawn from the seed alone, true closures from stream 0
 _HALFWAY = "when, as a part of the whole: 0 the first pose, 1 the last"
+
+
+@dataclass(slots=True)
+class Draft:
+    """Odometry, sightings and closures of n poses, in order of time.
+
+    Attributes
+    ----------
+    truth : (n, 3) or (n, 7) true poses
+    odometry : the same by dead reckoning
+    twist : (n, d) velocity since the pose before
+    sightings, seen_at : what was seen, and (m,) from which pose
+    landmarks : true places by id
+    stamps_ns : (n,)
+    closures : true ones; false ones are added
+    wrong : by what was measured and its number (of odometry the later pose's), the faults that hit it
+    true_ids : of the landmarks that were really seen, whatever ids the sightings have now
+    """
+
+    space: Geometry
+    truth: Array
+    odometry: Array
+    twist: Array
+    sightings: list[Sighting]
+    seen_at: Index
+    landmarks: Mapping[str, Numbers]
+    stamps_ns: Index
+    closures: list[Closure]
+    wrong: dict[tuple[Measured, int], list[str]] = field(default_factory=dict)
+    true_ids: list[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.true_ids = [s.id for s in self.sightings]
+
+    def __len__(self) -> int:
+        return len(self.odometry)
+
+    def pose_at(self, fraction: float) -> int:
+        """The pose at a fraction of the drive: 0 is the first, 1 the last."""
+        return round(fraction * (len(self) - 1))
+
+    def mark(self, what: Measured, number: int, fault: str) -> None:
+        """Note that a fault has hit a measurement."""
+        faults = self.wrong.setdefault((what, number), [])
+        if fault not in faults:
+            faults.append(fault)
+
+    def spoil(self, number: int, fault: str, sighting: Sighting) -> None:
+        """Replace a sighting by a wrong one."""
+        self.mark("sighting", number, fault)
+        self.sightings[number] = sighting
+
+    def spoil_odometry(self, first: int, poses: Sequence[Numbers], factors: Array | float, fault: str) -> None:
+        """Replace odometry from a pose on by other poses; those behind move along. Twists there have factors."""
+        last = first + len(poses) - 1
+        self.odometry = moved_from(self.odometry, last, poses[-1])
+        self.odometry[first : last + 1] = poses
+        self.twist = self.twist.copy()
+        self.twist[first + 1 : last + 1] *= factors
+        for pose in range(first + 1, last + 1):
+            self.mark("odometry", pose, fault)
+
+    def seen_from(self, number: int, displaced: Array) -> Sighting:
+        """A sighting as it would have been, with its noise, if the landmark had been elsewhere.
+
+        Parameters
+        ----------
+        displaced : (2,) or (3,) by how much, in world
+        """
+        old, T_world_base = self.sightings[number], self.truth[self.seen_at[number]]
+        n = self.space.dimensions
+        if old.kind in ("position", "pose"):
+            moved = np.array(old.measured)
+            moved[:n] += self.space.turn(tuple(T_world_base)).T @ displaced
+            return replace(old, measured=tuple(moved.tolist()))
+        edge, at = self.space.sightings[old.kind], np.array([[0, len(T_world_base)]])
+        whole = edge.whole(np.array([*old.measured, *(old.T_base_sensor or ())])[None])
+        true = np.array(self.landmarks[self.true_ids[number]][:n])
+        before, after = (
+            edge.linearize(np.concatenate([T_world_base, place]), at, whole)[0][0] for place in (true, true + displaced)
+        )
+        moved = old.measured + after - before
+        angles = slice("range" in old.kind, None)
+        moved[angles] = se2.wrap(moved[angles])
+        return replace(old, measured=tuple(moved.tolist()))
+
+
+@dataclass(frozen=True, slots=True)
+class WrongMessage:
+    """A row of a recording's table: a wrong message, or one of its detections.
+
+    Attributes
+    ----------
+    index : of the detection or point in its message; empty of odometry
+    id : that it carries; of a closure, the earlier stamp
+    true_id : the landmark that was seen
+    """
+
+    topic: str
+    stamp_ns: int
+    index: int | str
+    id: str
+    fault: str
+    true_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class WrongLine:
+    """A row of a graph's table: a wrong edge.
+
+    Attributes
+    ----------
+    line : of the file, from 1
+    first, second : ids of its vertices, as in the file
+    true_second : empty of a closure
+    """
+
+    line: int
+    tag: str
+    first: int
+    second: int
+    fault: str
+    true_second: str = ""
+
+
+def write_table(path: Path | str, of: type, rows: Sequence[WrongMessage] | Sequence[WrongLine]) -> None:
+    """Write a table as CSV, below the names of the fields. Raises FormatError."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(field.name for field in fields(of))
+    writer.writerows(astuple(row) for row in rows)
+    write_text(path, text.getvalue())
+
+
+# -- kinds -----------------------------------------------------------------------------------------------------------
 
 
 def false_closures(
@@ -53,7 +193,11 @@ def false_closures(
     covariances = np.reshape([c.covariance for c in draft.closures], (-1, draft.space.dof, draft.space.dof))
     roots, at = Gaussian.from_covariance(covariances).sqrt_information, places(draft.truth)
     ends, measured, root = generator.false_closures(draft.truth[at], roots, rng, policy, rate, count, group)
-    draft.add_closures(at[ends], measured, root, "false_closures")
+    for (earlier, later), z, one in zip(draft.stamps_ns[at[ends]].tolist(), measured.tolist(), root, strict=True):
+        draft.mark("closure", len(draft.closures), "false_closures")
+        covariance = np.linalg.inv(one.T @ one)
+        flat = tuple((0.5 * (covariance + covariance.T)).ravel().tolist())
+        draft.closures.append(Closure(later, earlier, CLOSURES_TOPIC, tuple(z), flat))
 
 
 def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
@@ -140,11 +284,7 @@ def slip(
     slipped = [tuple(poses[first].tolist())]
     for step in steps.tolist():
         slipped.append(group.compose(slipped[-1], tuple(step)))
-    draft.odometry = moved_from(draft.odometry, last, slipped[-1])
-    draft.odometry[first : last + 1] = slipped
-    draft.twist = draft.twist.copy()
-    draft.twist[first + 1 : last + 1, :n] *= factor
-    draft.spoil_odometry(range(first + 1, last + 1), "slip")
+    draft.spoil_odometry(first, slipped, np.where(np.arange(draft.space.dof) < n, factor, 1.0), "slip")
 
 
 def carried(
@@ -159,12 +299,8 @@ def carried(
     if not (away >= distance_m).any():
         raise GraphSlamError(f"carried: after {at:g} of the whole it comes no farther than {away.max():.1f} m")
     last = first + int(np.argmax(away >= distance_m))
-    lifted = draft.odometry[first].copy()
-    draft.odometry = moved_from(draft.odometry, last, tuple(lifted.tolist()))
-    draft.odometry[first:last] = lifted
-    draft.twist = draft.twist.copy()
-    draft.twist[first + 1 : last + 1] = 0.0
-    draft.spoil_odometry(range(first + 1, last + 1), "carried")
+    lifted = tuple(draft.odometry[first].tolist())
+    draft.spoil_odometry(first, [lifted] * (last - first + 1), 0.0, "carried")
 
 
 def jump(
@@ -182,9 +318,8 @@ def jump(
     space = draft.space
     turned = [0.0] * (space.dof - space.dimensions - 1) + [turn_rad]
     ahead = [ahead_m, left_m, 0.0][: space.dimensions]
-    before = tuple(draft.odometry[later].tolist())
-    draft.odometry = moved_from(draft.odometry, later, space.group.retract(before, (*ahead, *turned)))
-    draft.spoil_odometry([later], "jump")
+    before, there = map(tuple, draft.odometry[later - 1 : later + 1].tolist())
+    draft.spoil_odometry(later - 1, [before, space.group.retract(there, (*ahead, *turned))], 1.0, "jump")
 
 
 KINDS = {

@@ -110,7 +110,8 @@ def _pose_graph(
     steps = np.column_stack([np.arange(len(truth) - 1), np.arange(1, len(truth))])
     odometry = _measured(space, rng, truth, steps, coarse)
     graph = Graph()
-    graph.add_vertices(space.pose, _composed(space, truth[0], odometry))
+    motions = np.stack(space.group.log(tuple(odometry.T)), axis=1)
+    graph.add_vertices(space.pose, integrate(tuple(truth[0].tolist()), motions))
     graph.add_edges(space.relative_pose, steps, odometry, Gaussian.from_sigmas(*coarse.tolist()), "odometry")
     if len(closures):
         seen = _measured(space, rng, truth, closures, near)
@@ -123,13 +124,3 @@ def _measured(space: Geometry, rng: Generator, truth: Array, pairs: Index, sigma
     exact = space.group.between(tuple(truth[pairs[:, 0]].T), tuple(truth[pairs[:, 1]].T))
     noise = rng.standard_normal((len(pairs), len(sigmas))) * sigmas
     return np.stack(space.group.retract(exact, tuple(noise.T)), axis=1)
-
-
-def _composed(space: Geometry, start: Array, steps: Array) -> Array:
-    """Poses (n + 1, k) from relative poses (n, k)."""
-    if space is SPATIAL:
-        return integrate(tuple(start.tolist()), np.stack(se3.log(tuple(steps.T)), axis=1))
-    theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    moved = se2.act((0.0, 0.0, theta[:-1]), (steps[:, 0], steps[:, 1]))
-    x, y = (first + np.concatenate([[0.0], np.cumsum(d)]) for first, d in zip(start[:2], moved, strict=True))
-    return np.stack([x, y, se2.wrap(theta)], axis=1)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.recordings.bag import open_bag
@@ -107,17 +106,12 @@ def test_a_fault_that_does_not_fit_is_refused_by_name():
             faulty_recording(recording, [Fault.parsed(fault)], seed=1)
 
 
-def run(capsys, *words):
-    code = cli.main([str(word) for word in words])
-    return code, *capsys.readouterr()
-
-
-def test_in_a_graph_the_table_names_the_lines_that_are_more_and_no_others(tmp_path, capsys):
+def test_in_a_graph_the_table_names_the_lines_that_are_more_and_no_others(tmp_path, told):
     clean, faulty = tmp_path / "clean.g2o", tmp_path / "faulty.g2o"
-    assert run(capsys, "simulate", "city", "--poses", 800, "--set", "blocks=8", "--out", clean)[0] == 0
+    assert told("simulate", "city", "--poses", 800, "--set", "blocks=8", "--out", clean)[0] == 0
     assert (tmp_path / "clean.truth.tum").is_file()
     faults = "--fault", "false_closures:policy=aliased", "--fault", "false_closures:count=7"
-    code, out, err = run(capsys, "simulate", clean, "--out", faulty, "--seed", 3, *faults)
+    code, out, err = told("simulate", clean, "--out", faulty, "--seed", 3, *faults)
     assert (code, err) == (0, "")
     with (tmp_path / "faulty.faults.csv").open() as stream:
         table = {int(row["line"]): row for row in csv.DictReader(stream)}
@@ -132,11 +126,11 @@ def test_in_a_graph_the_table_names_the_lines_that_are_more_and_no_others(tmp_pa
     assert read_g2o(faulty).graph.edge_count == true + len(table)
 
 
-def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
+def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, told):
     bag, table = tmp_path / "a.world.mcap", tmp_path / "a.world.faults.csv"
     hall = "simulate", "warehouse", "--set", "aisles=2", "--set", "aisle_m=6", "--out", bag
     faults = "--fault", "false_closures:rate=0.5,group=5", "--fault", "swapped_ids:at=0.6"
-    code, out, err = run(capsys, *hall, "--closures", 10, *faults)
+    code, out, err = told(*hall, "--closures", 10, *faults)
     assert (code, err) == (0, "")
     with table.open() as stream:
         rows = list(csv.DictReader(stream))
@@ -145,15 +139,15 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
     assert [row["fault"] for row in rows].count("false_closures") == 10
     assert open_bag(bag).topics["/closures"].count > 10
     table.unlink()
-    assert run(capsys, *hall, "--force")[0] == 0
+    assert told(*hall, "--force")[0] == 0
     assert not table.exists()
     assert "/closures" not in open_bag(bag).topics
 
 
-def test_a_command_that_cannot_be_done_is_refused_in_one_line(tmp_path, capsys):
+def test_a_command_that_cannot_be_done_is_refused_in_one_line(tmp_path, told):
     graph, out = tmp_path / "city.g2o", tmp_path / "out"
-    assert run(capsys, "simulate", "city", "--poses", 60, "--set", "blocks=3", "--out", graph)[0] == 0
-    for words, told in (
+    assert told("simulate", "city", "--poses", 60, "--set", "blocks=3", "--out", graph)[0] == 0
+    for words, says in (
         (["city", "--out", f"{out}.mcap"], "city is a graph: --out FILE.g2o"),
         (["manhattan", "--out", f"{out}.g2o"], "manhattan is a recording: --out FILE.mcap"),
         (["city", "--closures", "5", "--out", f"{out}.g2o"], "city: no use for --closures"),
@@ -165,17 +159,15 @@ def test_a_command_that_cannot_be_done_is_refused_in_one_line(tmp_path, capsys):
         ([graph, "--fault", "slip", "--out", f"{out}.g2o"], "slip: a graph has no messages"),
         (["none.g2o", "--out", f"{out}.g2o"], "no world 'none.g2o'"),
     ):
-        code, _, err = run(capsys, "simulate", *words)
+        code, _, err = told("simulate", *words)
         assert (code, err.count("\n")) == (2, 1), words
-        assert told in err
-    said = run(capsys, "simulate", "sphere", "--poses", 40, "--out", tmp_path / "s.g2o")[1]
+        assert says in err
+    said = told("simulate", "sphere", "--poses", 40, "--out", tmp_path / "s.g2o")[1]
     assert "sphere: with 40 poses nothing is closed: a larger --poses" in said
 
 
-def test_the_help_tells_every_fault_and_all_that_can_be_set(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["simulate", "--help"])
-    out = capsys.readouterr().out
+def test_the_help_tells_every_fault_and_all_that_can_be_set(told):
+    out = told("simulate", "--help")[1]
     assert "gnss_outage_s=0.0 [s]" in out and "aisle_m=12.0 [m]" in out
     for name, kind in (KINDS | MESSAGE_KINDS).items():
         assert f"  {name}: {about(kind)}" in out
