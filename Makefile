@@ -12,7 +12,7 @@
 # lint, format  check style, layers, budgets and types; correct the style
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
 # bench         measure ours against GTSAM and g2o into docs/figures, and the tables of the pages; hours
-# robust        the same with false closures and wrong ids; two hours, resumed where it was
+# robust        the same with false closures and wrong ids; two hours, each graph written when it is done
 # figures       measure the table that must not get worse, docs/figures/figures.csv, and compare; half an hour; WRITE=1 replaces it
 # pictures      draw the pictures of README.md and docs/ again, in Chromium
 # clean         remove what these made
@@ -170,7 +170,7 @@ bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
 	$(VENV)-bench/bin/python -m benchmarks.lifelong --keyframes 6000 --seeds 1 --write
 
 robust: $(VENV)-bench/stamp
-	$(VENV)-bench/bin/python -m benchmarks.robust --jobs 2 --keep benchmarks/results/robust --write
+	$(VENV)-bench/bin/python -m benchmarks.robust --jobs 2 --write
 
 figures: $(VENV)-bench/stamp
 	$(VENV)-bench/bin/python -m benchmarks.figures $(if $(WRITE),--write) $(if $(ONLY),--only '$(ONLY)')

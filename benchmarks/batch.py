@@ -17,17 +17,14 @@ from benchmarks.problem import Problem
 def race(problem: Problem, peers: Sequence[str], reps: int) -> table.Row:
     """A line of the table: CPU seconds, and in brackets what part of a peer's ours takes."""
 
-    def ask(name: str) -> Solved:
-        try:
-            return fresh.call(contenders.solve, name, problem, python=contenders.python_of(name))
-        except fresh.Crashed as error:
-            return Solved(fault=f"crashes: {error}")
+    def solve(name: str) -> Solved:
+        return fresh.call(contenders.solve, name, problem, python=contenders.python_of(name))
 
     names = [OURS, *peers]
     if not problem.planar and "g2o-gn" in peers:
         names.append(OURS_AS_G2O)  # the problem that g2o solves
     options.say(problem.name)
-    solved = options.in_turn(names, reps, ask, lambda one: one.cpu_s)
+    solved = options.in_turn(names, reps, solve)
     spent = {name: float(np.median([one.cpu_s for one in several])) for name, several in solved.items()}
     last = {name: several[-1] for name, several in solved.items()}
     costs = {name: judge.chi2(problem, one.poses, one.landmarks) for name, one in last.items()}

@@ -1,26 +1,27 @@
 """Whether the pipeline knows how far it is from the truth: NEES over many drives through worlds with known noise.
 
-``python -m benchmarks.consistency [WORLD ...]``. Each seed is a drive or flight through ``GraphSlam`` in memory,
-compared in the frame of its first pose. The simulator draws white errors of velocity, and the pipeline is told of them
-and of nothing else (``_TOLD``). Besides fixed seeds there are as many fresh ones, and with ``--changed`` settings that
-depart from that.
+``python -m benchmarks.consistency [WORLD ...]``. Each seed is a drive or flight, replayed and evaluated. The simulator
+draws white errors of velocity, and the pipeline is told of them and of nothing else (``_TOLD``). Besides fixed seeds
+there are as many fresh ones, and with ``--changed`` settings that depart from that.
 """
 
 import argparse
 import random
+import tempfile
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from benchmarks import options, table
-from graph_slam_ros.analysis.consistency import Nees, landmark_errors, pose_errors
+from graph_slam_ros.analysis.consistency import Nees
+from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.cli import arguments as values
-from graph_slam_ros.lie import se3
-from graph_slam_ros.messages.results import landmark_estimates
-from graph_slam_ros.slam import Config, Control, GraphSlam
-from graph_slam_ros.tools.simulation import measurements, simulate
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import simulate, write_bag
 from graph_slam_ros.typing import Array
 
 _BAND = 0.999
@@ -54,30 +55,15 @@ _CHANGED: dict[str, dict[str, Any]] = {
 
 
 def drive(name: str, seed: int, settings: Mapping[str, Any]) -> tuple[Nees, Nees]:
-    """NEES of the last pose and of the landmarks of a drive, online and solved at its end."""
+    """NEES of the last pose and of the landmarks of a drive, solved at its end."""
     world, dimensions, how = _WORLDS[name]
-    recording = simulate(world, seed, correlation_time_s=0.0, **how)
-    slam = GraphSlam(Config.from_mapping({"world.dimensions": dimensions, **settings}))
-    for m in [*measurements(recording), Control("end"), Control("optimize")]:
-        slam.process(m)
-    view, found = slam.view, landmark_estimates(slam.view)
-    # Keyframes are at stamps of odometry, for which the simulator knows the truth.
-    estimate = view.trajectory()
-    true = recording.T_world_base[np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns)]
-    if dimensions == 2:
-        estimate, true = se3.in_space(estimate), se3.in_space(true)
-    covariances = view.keyframe_covariances()
-    positions, true_positions = np.zeros((len(found), 3)), np.zeros((len(found), 3))
-    of_positions = np.zeros((len(found), 3, 3))
-    for k, (landmark, value, covariance) in enumerate(found):
-        positions[k, :dimensions] = value[:dimensions]
-        true_positions[k, :dimensions] = recording.landmarks[landmark][:dimensions]
-        of_positions[k, :dimensions, :dimensions] = covariance[:dimensions, :dimensions]
-    poses, of_poses = pose_errors(estimate, true, covariances)
-    landmarks = landmark_errors(positions, true_positions, of_positions, estimate[0], true[0], covariances[0])
-    last, marks = Nees.of(poses[-1:], of_poses[-1:]), Nees.of(*landmarks)
-    assert last is not None and marks is not None and not marks.skipped
-    return last, marks
+    with tempfile.TemporaryDirectory() as folder:
+        bag, run = Path(folder) / "drive.mcap", Path(folder) / "run"
+        write_bag(simulate(world, seed, correlation_time_s=0.0, **how), bag)
+        replay(bag, run, Config.from_mapping({"world.dimensions": dimensions, **settings}))
+        found = evaluate(run, str(bag)).consistency
+    assert found is not None and found.last_pose is not None and found.landmarks is not None
+    return found.last_pose, found.landmarks
 
 
 def measure(name: str, seeds: range, settings: Mapping[str, Any]) -> Iterator[str]:

@@ -16,7 +16,6 @@ import numpy as np
 from benchmarks import contenders, datasets, fresh, judge, options, trials, victoria_park
 from benchmarks.contenders import OURS
 from benchmarks.drive import drive
-from benchmarks.fresh import Kept, digest
 from benchmarks.problem import Array, Index, Problem, landmark_problem
 from benchmarks.trials import Trial
 from graph_slam_ros.analysis.path_error import interpolated
@@ -101,25 +100,17 @@ class Drawn:
         return Course(self.problem.name, partial(trials.trial, self.problem, self.problem.poses), error_m, "wrong_ids")
 
 
-def recorded(kept: Kept) -> Iterator[Course]:
+def recorded() -> Iterator[Course]:
     """All recordings that are at hand; what is not is said."""
-    for course in (*(partial(of_robot, robot=robot) for robot in range(1, 6)), of_park):
+    for course in (*(partial(of_robot, robot) for robot in range(1, 6)), of_park):
         try:
-            yield course(kept)
+            yield course()
         except datasets.Absent as error:
             options.say(f"skipped: {error}")
 
 
-def of_robot(kept: Kept, robot: int) -> Course:
+def of_robot(robot: int) -> Course:
     """That of a robot of MR.CLAM set 7. Raises ``datasets.Absent``."""
-    name = f"MR.CLAM 7, robot {robot}"
-    drawn, truth = kept.ask(digest(name, contenders.code_of(OURS)), partial(_mrclam, name, robot))
-    known = np.isfinite(truth).all(axis=1)
-    return drawn.course(lambda poses: judge.position_error(poses[known], truth[known]))
-
-
-def _mrclam(name: str, robot: int) -> tuple[Drawn, Array]:
-    """And the true poses (n, 3) at the stamps of the sightings, NaN where they are not known."""
     with tempfile.TemporaryDirectory() as folder:
         path = datasets.mrclam(robot, Path(folder) / "bag")
         bag, config = open_bag(path), Config.from_mapping({"map.condense": False})  # every sighting is wanted
@@ -128,19 +119,17 @@ def _mrclam(name: str, robot: int) -> tuple[Drawn, Array]:
             for m in several:
                 slam.process(m)
         slam.process(Control("end"))
-        drawn = Drawn.of(name, slam.view)
-        return drawn, np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, drawn.stamps_s)))
+        drawn = Drawn.of(f"MR.CLAM 7, robot {robot}", slam.view)
+        truth = np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, drawn.stamps_s)))
+    known = np.isfinite(truth).all(axis=1)
+    return drawn.course(lambda poses: judge.position_error(poses[known], truth[known]))
 
 
-def of_park(kept: Kept) -> Course:
+def of_park() -> Course:
     """That of Victoria Park, against GPS. Raises ``datasets.Absent``."""
     drive = victoria_park.read_drive(datasets.PARK)
-
-    def drawn() -> Drawn:
-        options.say("Victoria Park: telling which tree is which takes a quarter of an hour")
-        return Drawn.of("Victoria Park", victoria_park.run(drive).view)
-
-    graph, fixes = kept.ask(digest("Victoria Park", contenders.code_of(OURS)), drawn), drive.quiet_fixes()
+    options.say("Victoria Park: telling which tree is which takes a quarter of an hour")
+    graph, fixes = Drawn.of("Victoria Park", victoria_park.run(drive).view), drive.quiet_fixes()
 
     def error_m(poses: Array) -> float:
         return judge.rms(victoria_park.Track.of_laser(graph.stamps_s, poses).at(fixes.stamps_s), fixes.positions)

@@ -2,11 +2,11 @@
 
 import gc
 import time
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from benchmarks import contenders
+from benchmarks.contenders import Solved
 from benchmarks.problem import Array, Problem, Step
 from graph_slam_ros.lie import se2, se3, so3
 
@@ -14,30 +14,13 @@ _REHEARSED = 300  # poses that are driven before the clock runs, so that code is
 _PATIENCE_S = 600.0  # of CPU time, after which a drive is called off
 
 
-@dataclass(slots=True)
-class Drive:
-    """How it went.
-
-    Attributes
-    ----------
-    step_s : CPU time of each step
-    poses, landmarks : the estimate after the last step
-    fault : why it ended early; empty where it did not
-    """
-
-    step_s: Array
-    poses: Array = field(default_factory=lambda: np.empty(0))
-    landmarks: Array = field(default_factory=lambda: np.empty(0))
-    fault: str = ""
-
-
-def drive(name: str, problem: Problem, read_path: bool) -> Drive:
+def drive(name: str, problem: Problem, read_path: bool) -> Solved:
     """Drive through a problem, and read all poses after each step, or the newest alone."""
     _through(name, problem.prefix(_REHEARSED), read_path)
     return _through(name, problem, read_path)
 
 
-def _through(name: str, problem: Problem, read_path: bool) -> Drive:
+def _through(name: str, problem: Problem, read_path: bool) -> Solved:
     contender = contenders.online(name, problem)
     steps = list(zip(problem.steps(), contender.prepared(problem).steps(), strict=True))
     step_s = np.zeros(len(steps))
@@ -53,12 +36,12 @@ def _through(name: str, problem: Problem, read_path: bool) -> Drive:
             step_s[k] = time.process_time() - begin
         except Exception as error:  # whatever a library throws is its result
             reason = next(filter(None, map(str.strip, str(error).splitlines())), type(error).__name__)
-            return Drive(step_s[:k], fault=f"throws at pose {k}: {reason}")
+            return Solved(step_s[:k], fault=f"throws at pose {k}: {reason}")
         spent += step_s[k]
         if spent > _PATIENCE_S:
             fault = f"called off at pose {k} after {spent:.0f} s"
             break
-    return Drive(step_s[: k + 1], *contender.estimate(), fault)
+    return Solved(step_s[: k + 1], *contender.estimate(), fault)
 
 
 def predicted(contender: contenders.Online, step: Step, problem: Problem) -> tuple[Array, Array]:

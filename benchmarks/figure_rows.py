@@ -1,12 +1,11 @@
 """Rows of figures, the committed table of them, and the comparison: what is worse, gone, or not measured."""
 
-import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 
-from benchmarks.fresh import ROOT
+from benchmarks import table
 
-TABLE = ROOT / "docs/figures/figures.csv"
+TABLE = "figures"
 RESULT, TIME, COST = 1.02, 1.3, 1.001
 """Tolerances: of results, of CPU times, which vary by a fifth from run to run, and of chi2."""
 NEVER = float("inf")
@@ -54,21 +53,13 @@ class Outcome:
 
 def read_table() -> dict[str, Row]:
     """Return the committed rows, by name."""
-    if not TABLE.exists():
-        return {}
-    with TABLE.open(encoding="utf-8", newline="") as file:
-        rows = [{k: float(v) if k in _NUMBERS else v for k, v in row.items()} for row in csv.DictReader(file)]
+    rows = [{k: float(v) if k in _NUMBERS else v for k, v in row.items()} for row in table.read(TABLE)]
     return {str(row["name"]): Row(**row) for row in rows}  # type: ignore[arg-type]
 
 
 def write_table(rows: Iterable[Row]) -> None:
     """Replace the table."""
-    TABLE.parent.mkdir(parents=True, exist_ok=True)
-    names = [one.name for one in fields(Row)]
-    with TABLE.open("w", encoding="utf-8", newline="") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(names)
-        out.writerows([_text(getattr(row, name)) for name in names] for row in rows)
+    table.store(TABLE, [{one.name: _text(getattr(row, one.name)) for one in fields(Row)} for row in rows])
 
 
 def _text(value: float | str) -> str:

@@ -26,7 +26,6 @@ from benchmarks.carried import MOMENTS_S, Carried
 from benchmarks.contenders import OURS
 from benchmarks.datasets import DATASETS, Absent, mrclam
 from benchmarks.figure_rows import COST, NEVER, TABLE, TIME, Outcome, Row, compare, read_table, write_table
-from benchmarks.fresh import Kept
 from benchmarks.options import say
 from benchmarks.problem import Problem, read_problem
 from benchmarks.robust import Race, score
@@ -145,9 +144,9 @@ def clean(drives: Sequence[tuple[str, int, dict[str, Any]]]) -> Iterator[Row]:
 
 def false_closures(name: str, poses: int, policy: str, rate: float) -> Iterator[Row]:
     """False measurements in a graph, or wrong ids of a robot; everything is solved at the end."""
-    race = Race((), 1, 1, Kept(Path("kept")))
+    race = Race((), 1, 1)
     if name.startswith("MR.CLAM"):
-        course = courses.of_robot(race.kept, int(name[-1]))
+        course = courses.of_robot(int(name[-1]))
     else:
         course = courses.of_graph(_graph(name).prefix(poses))
     trial = course.trial(policy, rate, 0)
@@ -306,7 +305,7 @@ def _known(value: float | None) -> float:
 def main() -> None:
     """The programme."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--write", action="store_true", help=f"into {TABLE.relative_to(fresh.ROOT)}")
+    parser.add_argument("--write", action="store_true", help=f"into docs/figures/{TABLE}.csv")
     parser.add_argument("--only", default="", metavar="TEXT", help="rows whose name begins with it")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="results at a time (default: 2)")
     args = parser.parse_args()

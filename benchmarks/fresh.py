@@ -1,9 +1,5 @@
-"""Calls in a fresh process on one core: nobody profits from, or pays for, what another left behind.
+"""Calls in a fresh process on one core: nobody profits from, or pays for, what another left behind."""
 
-Answers can be kept in a folder: a programme of hours that was stopped goes on where it was.
-"""
-
-import hashlib
 import math
 import os
 import pickle
@@ -13,11 +9,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -63,33 +56,6 @@ def children_s() -> float:
     """CPU time of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-@dataclass(frozen=True, slots=True)
-class Kept:
-    """What was answered, a file for each question."""
-
-    folder: Path
-
-    def ask(self, key: str, call: Callable[[], Any]) -> Any:
-        """The answer to a question that was asked before, or that of ``call``, which is kept."""
-        file = self.folder / f"{key}.pickle"
-        if file.exists():
-            return pickle.loads(file.read_bytes())
-        answer = call()
-        self.folder.mkdir(parents=True, exist_ok=True)
-        unfinished = file.with_suffix(".part")
-        unfinished.write_bytes(pickle.dumps(answer))
-        unfinished.replace(file)
-        return answer
-
-
-def digest(*parts: Any) -> str:
-    """Of arrays by their numbers, of all else by what is printed of it."""
-    out = hashlib.sha256()
-    for part in parts:
-        out.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-    return out.hexdigest()
 
 
 def _answer(asked: Path, answered: Path, cpu_s: float) -> None:

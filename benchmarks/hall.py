@@ -5,7 +5,7 @@ points, or tags whose orientation is seen, too.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,17 +23,6 @@ Seen = tuple[int, Array, Array]
 """A sighting: number of the landmark, its position or pose in the axes of the robot [m, rad], and the covariance."""
 
 
-@dataclass(frozen=True, slots=True)
-class Hall:
-    """A drive: true poses, landmarks, odometry, and what each keyframe sees."""
-
-    space: Geometry
-    poses: list[tuple[float, ...]]
-    points: Array
-    steps: list[tuple[float, ...]]
-    sightings: list[list[Seen]]
-
-
 class Course:
     """The same drive, a keyframe at a time: only its positions are in memory.
 
@@ -41,7 +30,12 @@ class Course:
     ----------
     where : true positions (n + 1, 2) of the keyframes and of the one after
     points : true positions of the landmarks; turns : their rotations, where they are tags
+    poses, steps, sightings : true poses, odometry, and what each keyframe sees; of ``hall`` alone
     """
+
+    poses: list[tuple[float, ...]]
+    steps: list[tuple[float, ...]]
+    sightings: list[list[Seen]]
 
     def __init__(self, seed: int, keyframes: int, space: Geometry = PLANAR, *, tags: bool = False) -> None:
         self.space, self._rng, n = space, np.random.default_rng(seed), space.dimensions
@@ -86,11 +80,12 @@ class Course:
         return mark, np.array((*position.tolist(), *group.compose(seen, group.exp(error))[n:])), whole
 
 
-def hall(seed: int, keyframes: int, space: Geometry = PLANAR, *, tags: bool = False) -> Hall:
-    """Make a drive."""
+def hall(seed: int, keyframes: int, space: Geometry = PLANAR, *, tags: bool = False) -> Course:
+    """Make a whole drive."""
     course = Course(seed, keyframes, space, tags=tags)
-    poses, steps, sightings = zip(*course.keyframes(), strict=True)
-    return Hall(space, list(poses), course.points, list(steps[1:]), list(sightings))
+    course.poses, steps, course.sightings = map(list, zip(*course.keyframes(), strict=True))
+    course.steps = steps[1:]
+    return course
 
 
 def _driven(rng: np.random.Generator, count: int) -> Array:
@@ -142,7 +137,7 @@ def config(space: Geometry, **values: Any) -> Config:
     return Config.from_mapping(known | {name.replace("_", ".", 1): value for name, value in values.items()})
 
 
-def measurements(world: Hall) -> Iterator[Measurement]:
+def measurements(world: Course) -> Iterator[Measurement]:
     """What a robot measures in a hall: odometry and sightings at each keyframe, one keyframe each 0.2 s."""
     at = world.space.identity
     for k, seen in enumerate(world.sightings):

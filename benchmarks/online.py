@@ -8,36 +8,29 @@ sighting. Each repetition runs each contender in a fresh process, in turn.
 import numpy as np
 
 from benchmarks import fresh, judge, options, table
-from benchmarks.contenders import ISAM2, OURS
-from benchmarks.drive import Drive, drive
+from benchmarks.contenders import ISAM2, OURS, Solved
+from benchmarks.drive import drive
 from benchmarks.problem import Problem
 
 _PARTS = ("part", "p99, part", "worst, part")
 
 
-def race(problem: Problem, reps: int, read_path: bool) -> dict[str, list[Drive]]:
+def race(problem: Problem, reps: int, read_path: bool) -> dict[str, list[Solved]]:
     """The drives of ours and of iSAM2."""
-
-    def ask(name: str) -> Drive:
-        try:
-            return fresh.call(drive, name, problem, read_path)
-        except fresh.Crashed as error:
-            return Drive(np.zeros(0), fault=f"crashes: {error}")
-
     options.say(problem.name)
     fresh.call(drive, OURS, problem.prefix(1000), read_path)  # not counted: what is not yet compiled is compiled
-    return options.in_turn([OURS, ISAM2], reps, ask, lambda one: float(one.step_s.sum()))
+    return options.in_turn([OURS, ISAM2], reps, lambda name: fresh.call(drive, name, problem, read_path))
 
 
-def times(drives: list[Drive]) -> tuple[float, float, float]:
+def times(drives: list[Solved]) -> tuple[float, float, float]:
     """Medians over the repetitions of the whole time, the 99th percentile of steps, and the worst."""
-    steps = [one.step_s for one in drives]
-    per_drive = [(float(s.sum()), float(np.percentile(s, 99)), float(s.max())) for s in steps if len(s)]
+    steps = [np.asarray(one.step_s) for one in drives if len(one.step_s)]
+    per_drive = [(s.sum(), np.percentile(s, 99), s.max()) for s in steps]
     whole, p99, worst = np.median(per_drive, axis=0).tolist() if per_drive else (0.0, 0.0, 0.0)
     return whole, p99, worst
 
 
-def row(problem: Problem, drives: dict[str, list[Drive]]) -> table.Row:
+def row(problem: Problem, drives: dict[str, list[Solved]]) -> table.Row:
     """A line of the table; *part* is our time over iSAM2's."""
     last = {name: several[-1] for name, several in drives.items()}
     spent = {name: times(several) for name, several in drives.items()}

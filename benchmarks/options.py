@@ -5,9 +5,9 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar
 
-from benchmarks import table
+from benchmarks import fresh, table
+from benchmarks.contenders import Solved
 from benchmarks.datasets import DATASETS
 from benchmarks.problem import Problem, chain_problem, read_problem, sphere_problem
 from graph_slam_ros.cli import arguments as values
@@ -31,7 +31,6 @@ _BEST_KNOWN = {
     "victoria_park": 6184.12,
     "w10000": 289.7259,
 }
-_Answer = TypeVar("_Answer")
 
 
 def parser(about: str | None) -> argparse.ArgumentParser:
@@ -91,16 +90,17 @@ def _usual_files() -> list[Path]:
     return found
 
 
-def in_turn(
-    names: Sequence[str], reps: int, ask: Callable[[str], _Answer], seconds: Callable[[_Answer], float]
-) -> dict[str, list[_Answer]]:
-    """Answers of contenders that take turns; who is slow is asked once."""
-    found: dict[str, list[_Answer]] = {name: [] for name in names}
+def in_turn(names: Sequence[str], reps: int, solve: Callable[[str], Solved]) -> dict[str, list[Solved]]:
+    """Answers of contenders that take turns, each in a fresh process; who is slow is asked once."""
+    found: dict[str, list[Solved]] = {name: [] for name in names}
     for _ in range(reps):
         for name, answers in found.items():
-            if not answers or seconds(answers[0]) < _SLOW_S:
-                answers.append(ask(name))
-                say(f"{name}: {seconds(answers[-1]):.3f} s")
+            if not answers or answers[0].cpu_s < _SLOW_S:
+                try:
+                    answers.append(solve(name))
+                except fresh.Crashed as error:
+                    answers.append(Solved(fault=f"crashes: {error}"))
+                say(f"{name}: {answers[-1].cpu_s:.3f} s")
     return found
 
 

@@ -9,11 +9,9 @@ there is truth against that.
 import argparse
 import math
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Literal
 
@@ -23,7 +21,6 @@ from scipy.stats import chi2
 from benchmarks import contenders, courses, fresh, judge, options, table
 from benchmarks.contenders import OURS, OURS_PLAIN, ROBUST_PEERS, Believed
 from benchmarks.courses import Course
-from benchmarks.fresh import Kept, digest
 from benchmarks.trials import ID_POLICIES, POLICIES, Trial
 from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.errors import GraphSlamError
@@ -113,19 +110,21 @@ class Race:
     peers: Sequence[str]
     seeds: int
     jobs: int
-    kept: Kept
 
-    def cell(self, course: Course, policy: str, rate: float) -> table.Row:
+    def plain_s(self, course: Course) -> float:
+        """CPU time of ours without a loss and without false measurements."""
+        clean = course.trial(course.clean_policy, 0.0, 0)
+        options.say(f"{course.name}: odometry alone {course.error_m(clean.odometry.poses):.3f} m")
+        return self._scores(course, (OURS_PLAIN,), clean)[f"{OURS_PLAIN}, batch"].cpu_s
+
+    def cell(self, course: Course, policy: str, rate: float, plain_s: float) -> table.Row:
         """The line of one cell: ours online and solved, its time over that without a loss, and each peer."""
         is_clean = rate == 0.0 and policy != "swapped_ids"
         trials = [course.trial(policy, rate, seed) for seed in range(1 if is_clean else self.seeds)]
         with ThreadPoolExecutor(self.jobs) as pool:
             found = list(pool.map(lambda trial: self._scores(course, (OURS, *self.peers), trial), trials))
         by_column = {column: [one[column] for one in found] for column in found[0]}
-        clean = course.trial(course.clean_policy, 0.0, 0)
-        plain = self._scores(course, (OURS_PLAIN,), clean)[f"{OURS_PLAIN}, batch"]
-        options.say(f"{course.name}: odometry alone {course.error_m(clean.odometry.poses):.3f} m")
-        times = [one.cpu_s / plain.cpu_s for one in by_column[f"{OURS}, batch"] if not one.fault]
+        times = [one.cpu_s / plain_s for one in by_column[f"{OURS}, batch"] if not one.fault]
         false = trials[0].false
         return {
             "graph": course.name,
@@ -146,14 +145,10 @@ class Race:
     def believe(self, who: str, trial: Trial) -> Believed:
         """What a contender makes of a trial, in a process of its own."""
         patience_s = np.inf if who.startswith(OURS) else _PATIENCE_S
-
-        def call() -> Believed:
-            try:
-                return fresh.call(contenders.believe, who, trial.odometry, trial.closures, cpu_s=patience_s)
-            except fresh.Crashed as error:
-                return Believed(fault=str(error))
-
-        return self.kept.ask(digest(who, contenders.code_of(who), *trial.arrays()), call)
+        try:
+            return fresh.call(contenders.believe, who, trial.odometry, trial.closures, cpu_s=patience_s)
+        except fresh.Crashed as error:
+            return Believed(fault=str(error))
 
 
 def _spread(scores: Sequence[Score]) -> str:
@@ -168,20 +163,24 @@ def _spread(scores: Sequence[Score]) -> str:
     return " ".join(words)
 
 
-def cells(args: argparse.Namespace, kept: Kept) -> Iterator[tuple[Course, str, float]]:
-    """What is asked for; what cannot be raced is said and skipped."""
-    asked = None if args.policy is None else dict.fromkeys(args.policy, args.rate)
-    for course in _courses(args, kept):
-        rates = asked or _CELLS.get(course.name.split(",")[0])
-        if rates is None:
-            options.say(f"skipped: {course.name}: tell --policy and --rate")
+def rows_of(race: Race, course: Course, rates: Rates) -> tuple[list[table.Row], list[table.Row]]:
+    """The lines of a course, with false closures, and one with wrong ids; what cannot be raced is said and skipped."""
+    closures, ids, plain_s = list[table.Row](), table.Row(), race.plain_s(course)
+    for policy, rate in ((policy, rate) for policy, several in rates.items() for rate in several):
+        try:
+            row = race.cell(course, policy, rate, plain_s)
+        except GraphSlamError as error:
+            options.say(f"skipped: {error}")
             continue
-        for policy, several in rates.items():
-            for rate in several:
-                yield course, policy, rate
+        if policy in ID_POLICIES:
+            what = "two tags swapped" if policy == "swapped_ids" else f"{rate:.0%} wrong ids" if rate else "clean"
+            ids |= {what: row[f"{OURS}, solved"]}
+        else:
+            closures.append(row)
+    return closures, [{"error in m, solved": course.name} | ids] if ids else []
 
 
-def _courses(args: argparse.Namespace, kept: Kept) -> Iterator[Course]:
+def _courses(args: argparse.Namespace) -> Iterator[Course]:
     for problem in () if args.recordings else options.problems(args):
         if args.files or args.policy or problem.name in _CELLS:
             try:
@@ -189,7 +188,7 @@ def _courses(args: argparse.Namespace, kept: Kept) -> Iterator[Course]:
             except GraphSlamError as error:
                 options.say(f"skipped: {error}")
     if not args.files:
-        yield from courses.recorded(kept)
+        yield from courses.recorded()
 
 
 def main() -> None:
@@ -199,32 +198,22 @@ def main() -> None:
     parser.add_argument("--recordings", action="store_true", help="recorded drives among landmarks alone")
     policies = f"of {', '.join(POLICIES)}"
     parser.add_argument("--policy", type=lambda text: options.chosen(text, POLICIES), metavar="NAME,...", help=policies)
-    rates = "false ones of all, from 0 up to 1 (0.3)"
-    parser.add_argument("--rate", type=_numbers, default=[0.3], metavar="R,...", help=rates)
+    about = "false ones of all, from 0 up to 1 (0.3)"
+    parser.add_argument("--rate", type=_numbers, default=[0.3], metavar="R,...", help=about)
     parser.add_argument("--seeds", type=values.count, default=3, metavar="N", help="of each cell (3)")
     parser.add_argument("--jobs", type=values.count, default=1, metavar="N", help="seeds at a time")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of what was run; what is there is not run again")
     args = parser.parse_args()
-    if args.keep is not None and args.keep.exists() and not args.keep.is_dir():
-        parser.error(f"argument --keep: {args.keep} is not a folder")
-    rows, solved = list[table.Row](), dict[str, table.Row]()
-    with tempfile.TemporaryDirectory() as folder:
-        race = Race(args.peers, args.seeds, args.jobs, Kept(args.keep or Path(folder)))
-        for course, policy, rate in cells(args, race.kept):
-            try:
-                row = race.cell(course, policy, rate)
-            except GraphSlamError as error:
-                options.say(f"skipped: {error}")
-                continue
-            if policy in ID_POLICIES:
-                what = "two tags swapped" if policy == "swapped_ids" else f"{rate:.0%} wrong ids" if rate else "clean"
-                solved.setdefault(course.name, {"error in m, solved": course.name})[what] = row[f"{OURS}, solved"]
-            else:
-                rows.append(row)
-    for name, found, keys in (("robust", rows, 2), ("wrong_ids", list(solved.values()), 1)):
-        if found:
-            table.finish(name, found, write=args.write, note=f"{args.seeds} seeds", keys=keys)
-    if not rows and not solved:
+    race, is_empty = Race(args.peers, args.seeds, args.jobs), True
+    for course in _courses(args):
+        rates = dict.fromkeys(args.policy, args.rate) if args.policy else _CELLS.get(course.name.split(",")[0])
+        if rates is None:
+            options.say(f"skipped: {course.name}: tell --policy and --rate")
+            continue
+        for name, keys, rows in zip(("robust", "wrong_ids"), (2, 1), rows_of(race, course, rates), strict=True):
+            if rows:
+                is_empty = False
+                table.finish(name, rows, write=args.write, note=f"{args.seeds} seeds", keys=keys)
+    if is_empty:
         sys.exit(2)  # why has been said
 
 

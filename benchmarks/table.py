@@ -13,7 +13,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -45,13 +45,17 @@ def finish(name: str, rows: Sequence[Row], *, write: bool, note: str = "", keys:
     found = [{column: _cell(value) for column, value in row.items()} | aside for row in rows]
     print(markdown(found), flush=True)
     if write:
-        by_key = {tuple(row.values())[:keys]: row for row in (*read(name), *found)}
-        columns = dict.fromkeys(column for row in by_key.values() for column in row if column not in _ASIDE)
-        with (FIGURES / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
-            out = csv.DictWriter(file, [*columns, *_ASIDE], restval="", lineterminator="\n")
-            out.writeheader()
-            out.writerows(by_key.values())
+        store(name, {tuple(row.values())[:keys]: row for row in (*read(name), *found)}.values())
         write_pages()
+
+
+def store(name: str, rows: Collection[dict[str, str]]) -> None:
+    """Replace a table."""
+    columns = dict.fromkeys(column for row in rows for column in row)
+    with (FIGURES / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
+        out = csv.DictWriter(file, sorted(columns, key=_ASIDE.__contains__), restval="", lineterminator="\n")
+        out.writeheader()
+        out.writerows(rows)
 
 
 def read(name: str) -> list[dict[str, str]]:

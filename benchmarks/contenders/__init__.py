@@ -1,8 +1,8 @@
 """The contenders, by name, and what is asked of them: driving pose by pose, or solving a graph as a whole."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from importlib import import_module
 from typing import Protocol
 
@@ -55,18 +55,25 @@ class Online(Protocol):
 
 @dataclass(slots=True)
 class Solved:
-    """How a batch solver went.
+    """How a contender went, pose by pose or with the graph as a whole.
 
     Attributes
     ----------
-    cpu_s : CPU time from arrays to convergence: making the library's own graph, ordering and symbolic analysis included
+    step_s : CPU time of each step; of a whole graph there is one: from arrays to convergence, making the library's own
+        graph, ordering and symbolic analysis included
+    poses, landmarks : the estimate after the last step
     fault : why there is no estimate, or it is none to be proud of; empty where all is well
     """
 
-    cpu_s: float = 0.0
+    step_s: Array | Sequence[float] = ()
     poses: Array = field(default_factory=lambda: np.empty(0))
     landmarks: Array = field(default_factory=lambda: np.empty(0))
     fault: str = ""
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of all steps."""
+        return float(sum(self.step_s))
 
 
 @dataclass(slots=True)
@@ -119,14 +126,6 @@ def believe(name: str, problem: Problem, closures: Edges) -> Believed:
 def settled(before: float, after: float) -> bool:
     """The rule by which every iteration ends."""
     return abs(before - after) <= TOLERANCE * after
-
-
-@cache
-def code_of(name: str) -> bytes:
-    """What a contender among false measurements runs: when that changes, it is asked anew."""
-    files = [ROOT / "benchmarks/contenders" / f"{_ROBUST[name]}.py", ROOT / "benchmarks/requirements.txt"]
-    files += sorted((ROOT / "graph_slam_ros").rglob("*.py")) if name.startswith(OURS) else []
-    return b"".join(file.read_bytes() for file in files)
 
 
 def python_of(name: str) -> str:

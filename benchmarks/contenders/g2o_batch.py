@@ -41,7 +41,7 @@ def solve(problem: Problem, name: str) -> Solved:
     if iterations in (0, MAX_ITERATIONS):
         fault = fault or "not converged"
     landmarks = np.array([point.estimate() for point in points]).reshape(-1, 2)
-    return Solved(cpu_s, _numbers(poses, problem.planar), landmarks, fault)
+    return Solved([cpu_s], _numbers(poses, problem.planar), landmarks, fault)
 
 
 def _algorithm(problem: Problem) -> g2o.OptimizationAlgorithm:

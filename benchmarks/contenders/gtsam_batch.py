@@ -30,10 +30,10 @@ def solve(problem: Problem, name: str) -> Solved:
         optimizer = kind(graph, values)
         fault = _iterated(optimizer)
     except RuntimeError as error:
-        return Solved(time.process_time() - begin, fault=words.thrown(error))
+        return Solved([time.process_time() - begin], fault=words.thrown(error))
     cpu_s = time.process_time() - begin
     answer = words.estimate(optimizer.values(), len(given.poses), len(given.landmarks), given.planar)
-    return Solved(cpu_s, *answer, fault)
+    return Solved([cpu_s], *answer, fault)
 
 
 def believe(problem: Problem, closures: Edges, name: str) -> Believed:

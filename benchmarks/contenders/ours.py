@@ -99,7 +99,7 @@ def solve(problem: Problem, name: str) -> Solved:
         solver.hold(int(poses[0]))
         report = solver.optimize(settings)
     except GraphSlamError as error:
-        return Solved(time.process_time() - begin, fault=f"refuses: {error}")
+        return Solved([time.process_time() - begin], fault=f"refuses: {error}")
     cpu_s = time.process_time() - begin
     fault = "" if report.converged else f"not converged: {report.stop}"
-    return Solved(cpu_s, solver.estimate(poses), solver.estimate(points), fault)
+    return Solved([cpu_s], solver.estimate(poses), solver.estimate(points), fault)

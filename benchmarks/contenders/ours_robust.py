@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.contenders import OURS, OURS_PLAIN, Believed
 from benchmarks.problem import Array, Edges, Problem
-from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, MapView, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.solver.linearization import loss_weights
 from graph_slam_ros.warmup import warmup
 
 _REHEARSED = 100  # poses that are driven before the clock runs, so that code is loaded
@@ -46,14 +46,11 @@ def believe(problem: Problem, closures: Edges, name: str) -> Believed:
 def weights(view: MapView, label: str) -> Array:
     """What each edge of a class counts (n,), from 0 to 1: as it was decided, and as its loss has it now."""
     edges = view.graph.edges_of(label)
-    fit, _ = view.solver.chi2_of(edges)
+    decided = view.graph.weights(edges)
     losses = view.solver.settings.losses.get(label, ())
-    out = np.empty(len(edges))
-    for k, edge in enumerate(edges.tolist()):
-        table, row = view.graph.row(edge)
-        loss = weight_and_cost(losses[-1].kind, losses[-1].scale, float(fit[k]))[0] if losses else 1.0
-        out[k] = table.weight.values[row] * loss
-    return out
+    return (
+        decided * loss_weights(losses[-1].kind, losses[-1].scale, view.solver.chi2_of(edges)[0]) if losses else decided
+    )
 
 
 def measurements(problem: Problem, closures: Edges) -> Iterator[Measurement]:
