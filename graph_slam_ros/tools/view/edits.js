@@ -11,7 +11,7 @@ function add(what) {
 }
 
 function put(what) {  // {do, ...arguments}
-  const names = new Set([...known.names, ...edits.list.map((one) => one.name)]);
+  const names = new Set([...data.tables.edits.map(([name]) => name), ...edits.list.map((one) => one.name)]);
   let name = "", k = edits.list.length;
   do { k += 1; name = `edit-${k}`; } while (names.has(name));
   const when = new Date().toISOString().replace(/\.\d+Z$/, "Z");
@@ -311,10 +311,10 @@ const panel = {
       event.preventDefault();
       toggle(ledger.chosen);
     });
-    if (known.edits.length) {
+    if (data.tables.edits.length) {
       byId("applied").append(element("h3", "Edits that the run has"));
       const list = element("ul");
-      for (const [name, text, who, when, why] of known.edits) list.append(element("li", `${name}: ${text}, by ${who}, ${when}: ${why}`));
+      for (const [name, text, who, when, why] of data.tables.edits) list.append(element("li", `${name}: ${text}, by ${who}, ${when}: ${why}`));
       byId("applied").append(list);
     }
   },

@@ -54,7 +54,7 @@ class Workbench:
 
     @property
     def page_data(self) -> dict[str, Any]:
-        """Return the source of plans, the kinds of edits, and the edits that the run has."""
+        """Return the source of plans, and the kinds of edits."""
         kinds = [
             {
                 "do": do,
@@ -68,17 +68,14 @@ class Workbench:
         ]
         run = self._saved
         headings = np.round(run.whole_path.poses()[:, 2], _DECIMALS).tolist() if run.space.dimensions == 2 else []
-        edits = [[shown(part) for part in (e.name, e.text, e.who, e.when, e.why)] for e in (a.edit for a in run.edits)]
         return {
             "plan": {"format": FORMAT, "version": VERSION, "source": self._source},
             "kinds": kinds,
             "losses": [*NAMES],
             "scale": self._scale,
             "who": _user(),
-            "edits": edits,
             "headings": headings,
             "run": _path(self._run),
-            "names": [one.edit.name for one in run.edits],
         }
 
     def solve(self, body: bytes) -> dict[str, Any]:
