@@ -2,6 +2,7 @@
 
 import gc
 import time
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def _through(name: str, problem: Problem, read_path: bool) -> Solved:
     return Solved(step_s[: k + 1], *contender.estimate(), fault)
 
 
-def predicted(contender: contenders.Online, step: Step, problem: Problem) -> tuple[Array, Array]:
+def predicted(contender: Any, step: Step, problem: Problem) -> tuple[Array, Array]:
     """Where the new pose and the new landmarks are expected, from the newest estimate of what they are seen from."""
     group = se2 if problem.planar else se3
     if step.parent < 0:

@@ -14,7 +14,7 @@ from statistics import median
 import numpy as np
 
 from benchmarks import options, table
-from benchmarks.live.robot import BARE, Process, Robot, node, ros, running
+from benchmarks.live.robot import BARE, Process, Robot, node, ros
 from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, CLOSURES, LANDMARKS, ODOMETRY
 from benchmarks.table import Row
 from graph_slam_ros.warmup import warmup
@@ -57,7 +57,7 @@ def cpu(short: bool) -> list[Row]:
 def _cpu_of(who: str, seconds: float) -> float:
     driven = {"seconds": seconds + 2 * _WARM_S, "odometry_hz": 100, "landmarks_hz": 10}
     if who == "a bare node":
-        with running(BARE, ODOMETRY, LANDMARKS) as bare, Robot("warehouse", **driven) as robot:
+        with Process(BARE, ODOMETRY, LANDMARKS) as bare, Robot("warehouse", **driven) as robot:
             return _spent(bare, robot, seconds)
     with node({}) as (ours, _), Robot("warehouse", "path", "pose", "odometry", "tf", **driven) as robot:
         return _spent(ours, robot, seconds)

@@ -31,11 +31,11 @@ class Online:
         self.known, self.seen = 0, 0
 
     def prepared(self, problem: Problem) -> Problem:
-        """See ``contenders.Online``."""
+        """See ``ours.Online``."""
         return words.prepared(problem)
 
     def take(self, step: Step, pose: Array, landmarks: Array, closures: Edges | None = None) -> None:
-        """See ``contenders.Online``; closures are under the loss, as sightings are."""
+        """See ``ours.Online``; closures are under the loss, as sightings are."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(step.pose, words.pose(pose))
         if step.pose == 0:
@@ -50,16 +50,16 @@ class Online:
         self.known, self.seen = step.pose + 1, step.landmarks.stop
 
     def path(self) -> Array:
-        """See ``contenders.Online``."""
+        """See ``ours.Online``."""
         return self.extract(self.isam.calculateEstimate())
 
     def pose(self, index: int) -> Array:
-        """See ``contenders.Online``."""
+        """See ``ours.Online``."""
         read = self.isam.calculateEstimatePose2 if self.planar else self.isam.calculateEstimatePose3
         return words.numbers(read(index))
 
     def estimate(self) -> tuple[Array, Array]:
-        """See ``contenders.Online``."""
+        """See ``ours.Online``."""
         return words.estimate(self.isam.calculateEstimate(), self.known, self.seen, self.planar)
 
 

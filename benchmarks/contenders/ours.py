@@ -25,7 +25,7 @@ _HALVED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])  # of the rotation vector, in
 
 
 class Online:
-    """The incremental solver."""
+    """The incremental solver, which is given one pose at a time."""
 
     def __init__(self, problem: Problem) -> None:
         warmup()
@@ -36,11 +36,11 @@ class Online:
         self.known, self.seen = 0, 0
 
     def prepared(self, problem: Problem) -> Problem:
-        """See ``contenders.Online``."""
+        """The problem with measurements and noise in the form the library takes; not timed."""
         return problem
 
     def take(self, step: Step, pose: Array, landmarks: Array) -> None:
-        """See ``contenders.Online``."""
+        """Take a step's pose and new landmarks at their predicted values, and its edges; be up to date after it."""
         graph = self.graph
         new = self.poses[step.pose : step.pose + 1] = graph.add_vertices(self.kind, pose[None])
         edges = self._add(self.edge, self.poses[step.relative.ends], step.relative)
@@ -58,15 +58,15 @@ class Online:
         self.solver.update()
 
     def path(self) -> Array:
-        """See ``contenders.Online``."""
+        """All poses so far as an array, in whatever numbers the library has for a pose."""
         return self.solver.estimate(self.poses[: self.known])
 
     def pose(self, index: int) -> Array:
-        """See ``contenders.Online``."""
+        """One pose, (3,) or (7,)."""
         return self.solver.estimate(self.poses[index : index + 1])[0]
 
     def estimate(self) -> tuple[Array, Array]:
-        """See ``contenders.Online``."""
+        """All poses, (n, 3) or (n, 7), and all landmarks, (n, 2)."""
         return self.path(), self.solver.estimate(self.points[: self.seen])
 
     def _add(self, edge: EdgeType, ends: Index, edges: Edges) -> Index:

@@ -63,6 +63,14 @@ class Process:
         status = Path(f"/proc/{self._popen.pid}/status").read_text()
         return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1]) / 1024.0
 
+    def __enter__(self) -> "Process":
+        """Return it."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End it."""
+        self.stop()
+
     def stop(self) -> None:
         """Ask it to end; after a while, end it."""
         if self._popen.poll() is None:
@@ -75,23 +83,13 @@ class Process:
 
 
 @contextlib.contextmanager
-def running(module: str, *words: str) -> Iterator[Process]:
-    """A process for as long as the context lasts."""
-    process = Process(module, *words)
-    try:
-        yield process
-    finally:
-        process.stop()
-
-
-@contextlib.contextmanager
 def node(parameters: dict[str, Any]) -> Iterator[tuple[Process, Path]]:
     """Our node, and the folder that it records into."""
     with tempfile.TemporaryDirectory() as folder:
         given = {"output.folder": f"{folder}/run"} | parameters
         texts = {key: str(value).lower() if isinstance(value, bool) else value for key, value in given.items()}
         words = [word for key, text in texts.items() for word in ("-p", f"{key}:={text}")]
-        with running(NODE, "--ros-args", "--log-level", "error", *words) as ours:
+        with Process(NODE, "--ros-args", "--log-level", "error", *words) as ours:
             yield ours, Path(folder) / "run"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import PCG64, Generator
 
 from benchmarks.problem import city_problem
+from graph_slam_ros.formats.cdr import stamp
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.recordings.bag import BagMessage, open_bag
@@ -99,8 +100,7 @@ STREAMS: dict[str, tuple[Callable[..., Iterator[BagMessage]], tuple[str, ...]]] 
 def later(m: BagMessage, by_ns: int) -> BagMessage:
     """The same at another time; headers inside keep theirs, nobody reads them."""
     stamp_ns = m.log_ns + by_ns
-    stamp = np.array([stamp_ns // _NS, stamp_ns % _NS], dtype="<u4").tobytes()
-    return BagMessage(m.topic, stamp_ns, m.cdr[:4] + stamp + m.cdr[12:])
+    return BagMessage(m.topic, stamp_ns, m.cdr[:4] + stamp(stamp_ns) + m.cdr[12:])
 
 
 def stamp_ns(cdr: bytes, at: int = 4) -> int:
