@@ -305,9 +305,9 @@ OF_RUNS: dict[str, Row] = {
     "not_converged": _checked("--set solve.max_iterations=1000; graph_slam explain RUN lists what fits worst"),
     "contradictory": _checked("measurements contradict each other: graph_slam explain RUN says which"),
     "contradicted": _checked(
-        "graph_slam explain RUN says why. Check units, signs (y and bearings to the left), the place of the sensor (TF "
-        "or INPUT.mount), its clock (INPUT.offset_s) and ids that are used twice. If only its noise is larger than "
-        "stated: --set INPUT.noise=sigmas --set INPUT.sigma_m=..."
+        "graph_slam explain RUN says why. Check units (metres and radians), signs (y and bearings to the left), the "
+        "place of the sensor (TF or INPUT.mount), its clock (INPUT.offset_s) and ids that are used twice. If only its "
+        "noise is larger than stated: --set INPUT.noise=sigmas --set INPUT.sigma_m=..."
     ),
     "contested": _checked("did it move, or is its id used twice?"),
     "unused": _checked(""),
