@@ -1,6 +1,6 @@
 """The topics of a recording that inputs are read from: named, configured, or the only ones of their type.
 
-Names of topics tell which robot of a recording they are of, and which are the truth.
+Names of topics tell which are the truth.
 """
 
 import re
@@ -105,26 +105,3 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
 def is_truth(topic: str) -> bool:
     """Return whether a topic has the truth, by its name: no sensor of the robot measured it."""
     return _TRUTH.search(topic) is not None
-
-
-def landmarks_of_other_robots(odometry: str, odometries: Sequence[str], landmarks: Sequence[str]) -> dict[str, str]:
-    """Return topics of landmarks in the namespace of another odometry, each with the reason to leave it out.
-
-    Parameters
-    ----------
-    odometry : the topic in use; if no landmarks are in its namespace, all may be of its robot
-    odometries, landmarks : all topics
-    """
-    own, out = _namespace(odometry), dict[str, str]()
-    if not own or all(_namespace(name) != own for name in landmarks):
-        return out
-    for other in odometries:
-        for name in landmarks:
-            if _namespace(name) == _namespace(other) != own:
-                out[name] = f"of the robot of {other}: --odom {other} --landmarks {name} replay that one"
-    return out
-
-
-def _namespace(topic: str) -> str:
-    """The first part of a topic's name; empty where it has only one."""
-    return topic.lstrip("/").partition("/")[0] if topic.count("/") > 1 else ""

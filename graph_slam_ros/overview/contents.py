@@ -1,7 +1,7 @@
 """A summary of a whole recording: the span and frames of each topic, and how it can be used."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
@@ -133,7 +133,13 @@ def root_of(links: Mapping[str, str], frame: str) -> str:
 def recording_of(bag: Bag) -> Recording:
     """Read a recording once."""
     out = Recording({name: TopicContents(topic) for name, topic in bag.topics.items()})
-    decoders = dict(_decoders(out))
+    known, decoders = known_types(), dict[str, Callable[[bytes], Any]]()
+    for name, one in out.topics.items():
+        if one.topic.type in known:
+            try:
+                decoders[name] = recorded_decoder(one.topic)
+            except (BagError, ConfigError) as error:
+                one.trouble = str(error)
     for message in bag.messages(set(bag.topics)):
         one = out.topics[message.topic]
         one.first_ns = one.first_ns or message.log_ns
@@ -150,16 +156,6 @@ def recording_of(bag: Bag) -> Recording:
         except Exception:  # damaged bytes: replay counts them
             one.trouble = one.trouble if one.frame or one.items else "its messages cannot be decoded"
     return out
-
-
-def _decoders(recording: Recording) -> Iterator[tuple[str, Callable[[bytes], Any]]]:
-    known = known_types()
-    for name, one in recording.topics.items():
-        if one.topic.type in known:
-            try:
-                yield name, recorded_decoder(one.topic)
-            except (BagError, ConfigError) as error:
-                one.trouble = str(error)
 
 
 def _add(recording: Recording, one: TopicContents, m: Any, log_ns: int) -> None:

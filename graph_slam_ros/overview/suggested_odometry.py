@@ -1,14 +1,15 @@
 """The odometry of a recording that a replay is to use, and the frames that it brings."""
 
+import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
-from graph_slam_ros.overview.chosen_inputs import TF_TOPIC, WORD, is_truth, landmarks_of_other_robots
+from graph_slam_ros.overview.chosen_inputs import TF_TOPIC, WORD, is_truth
 from graph_slam_ros.overview.contents import Recording, TopicContents
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
@@ -77,14 +78,22 @@ class OdometryChoice:
                 self._unused[one.topic.name] = "another odometry"
         if len(found) > 1:
             self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
-        seen = [name for name, one in self._recording.topics.items() if one.topic.type in (DETECTIONS, *LANDMARK_TYPES)]
-        self._unused |= landmarks_of_other_robots(best.topic.name, [one.topic.name for one in found], seen)
         self.topic, self.contents = best.topic.name, best
+        self._leave_out_other_robots([one.topic.name for one in found])
         self._frames(best.frame, best.child if best.topic.type == ODOMETRY else self.base)
         if best.off_plane > _OFF_PLANE * best.read:
             self.settings["world.dimensions"] = 3
             self.notes.append(f"{best.topic.name} leaves the plane: these are three dimensions")
         return True
+
+    def _leave_out_other_robots(self, odometries: Sequence[str]) -> None:
+        """Landmarks in the namespace of another odometry are of its robot, where any are in that of the chosen one."""
+        seen = [name for name, one in self._recording.topics.items() if one.topic.type in (DETECTIONS, *LANDMARK_TYPES)]
+        own = _namespace(self.topic)
+        if own and own in map(_namespace, seen):
+            for other, name in itertools.product(odometries, seen):
+                if _namespace(name) == _namespace(other) != own:
+                    self._unused[name] = f"of the robot of {other}: --odom {other} --landmarks {name} replay that one"
 
     def _of_poses(self) -> bool:
         """Choose poses that are odometry by the name of their frame or topic."""
@@ -153,6 +162,11 @@ class OdometryChoice:
             return ""
         roots = {parent for parent in fixed.values() if parent not in fixed and "base" in parent}
         return roots.pop() if len(roots) == 1 else ""
+
+
+def _namespace(topic: str) -> str:
+    """The first part of a topic's name; empty where it has only one."""
+    return topic.lstrip("/").partition("/")[0] if topic.count("/") > 1 else ""
 
 
 def readable(recording: Recording, unused: dict[str, str], *types: str) -> Iterator[TopicContents]:
