@@ -4,7 +4,7 @@ import argparse
 import json
 import shlex
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,19 +38,20 @@ def check(args: argparse.Namespace) -> int:
     done = checked(args.bag, settings, **topics, quick=args.quick, progress=console.progress("check"))
     if args.json:
         found = [one.as_dict() for one in done.findings]
-        console.show(json.dumps({"findings": found, "command": done.command, "losses": done.losses}))
+        command = done.suggestion.command() if done.suggestion else ""
+        console.show(json.dumps({"findings": found, "command": command, "losses": done.losses}))
     else:
         for one in done.findings:
             console.show(*lines(one))
         counts = {s: sum(one.severity == s for one in done.findings) for s in ("error", "warning", "note")}
         console.show(", ".join(f"{n} {s}{'' if n == 1 else 's'}" for s, n in counts.items()))
         mend = [text for one in done.findings if one.severity != "note" for text in one.settings]
-        last = {parse_setting(text)[0]: text for text in [*args.set, *mend]}  # of several, the last one counts
+        mended = dict(map(parse_setting, [*args.set, *mend]))  # of several, the last one counts
         own = [f"--config {shlex.quote(str(args.config))}"] if args.config else []
         if any(one.severity == "error" and not one.settings for one in done.findings):
             console.then(f"correct what is an error, then check again: {console.command('check', args.bag)}")
-        elif done.command:
-            console.then(" ".join([_with(done.command, last), *own]))
+        elif done.suggestion:
+            console.then(" ".join([done.suggestion.command(mended), *own]))
         else:
             console.then(console.command("info", args.bag))
     console.report_losses(done.losses, done.warnings)
@@ -83,16 +84,6 @@ def lines(one: Finding) -> Iterator[str]:
         yield "    remedy: " + " ".join(f"--set {shlex.quote(text)}" for text in one.settings)
     elif one.mend:
         yield f"    remedy: {one.mend}"
-
-
-def _with(command: str, settings: Mapping[str, str]) -> str:
-    """A command with the settings of some parameters, by dotted name, in place of those that it has of these."""
-    words = shlex.split(command)
-    given = {k: text for k, text in enumerate(words) if k and words[k - 1] == "--set"}
-    old = [k for k, text in given.items() if settings.get(parse_setting(text)[0], text) != text]
-    kept = [word for k, word in enumerate(words) if k not in old and k + 1 not in old]
-    more = [word for text in settings.values() if text not in given.values() for word in ("--set", text)]
-    return shlex.join([*kept, *more])
 
 
 def _amount(value: float, unit: str) -> str:

@@ -35,12 +35,12 @@ class Checked:
     Attributes
     ----------
     findings : the most severe first
-    command : the replay that was checked; empty where there is none
+    suggestion : of the replay that was checked; None where there is none
     losses, warnings : what could not be read
     """
 
     findings: list[Finding]
-    command: str
+    suggestion: Suggestion | None
     losses: list[str]
     warnings: list[str]
 
@@ -76,7 +76,7 @@ def check(
         if all(one.severity != "error" for one in found):  # which say why
             text = f"not ready for replay: {suggestion.trouble}"
             found.append(Finding("no_odometry", "error", 0, 1, "topics", text))
-        return Checked(in_order(found), "", bag.losses, bag.warnings)
+        return Checked(in_order(found), None, bag.losses, bag.warnings)
     config = Config.from_mapping(suggestion.assumed | settings)
     inputs = suggestion.inputs(config)
     collector, counters = Collector(config, inputs.topics, suggestion.assumed), Counters()
@@ -92,10 +92,8 @@ def check(
         found += with_inputs(columns, _trial(without(columns, moving), some))
     perhaps = [f"{name}: {suggestion.unused[name]}" for name in suggestion.perhaps]  # which may have landmarks
     found = [replace(f, text="; ".join([f.text, *perhaps])) if f.code == "no_landmarks" else f for f in found]
-    others = suggestion.settings.keys() - suggestion.assumed.keys()
-    command = "" if suggestion.trouble else suggestion.command(without=others)
-    found = of_gyro_or_wheels(found, config.gyro_input)
-    return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)
+    found = with_one_value(in_order(dict.fromkeys(of_gyro_or_wheels(found, config.gyro_input))))
+    return Checked(found, None if suggestion.trouble else suggestion, bag.losses, bag.warnings)
 
 
 def _for_trial(columns: Columns, measured: list[Measurements]) -> list[Measurements]:

@@ -105,16 +105,13 @@ class Suggestion:
         topics, (odometry, landmarks) = {name: self.topics[name] for name in used & self.topics.keys()}, self._asked
         return choose_inputs(self._bag, config, odometry or topics.get("odom"), landmarks or topics.get("detections"))
 
-    def command(
-        self, more: Mapping[str, Any] | None = None, without: Collection[str] = (), name: str = "replay"
-    ) -> str:
-        """The command to paste into a shell, with additional settings, and without some of its own."""
+    def command(self, more: Mapping[str, Any] = MappingProxyType({}), name: str = "replay") -> str:
+        """The command to paste into a shell, with additional settings, which come before what is assumed."""
         path = str(self._path)
         words = ["graph_slam", name, f"./{path}" if path.startswith("-") else path]
         for option, source in (("--odom", "odom"), ("--landmarks", "detections")):
             words += [option, self.topics[source]] if source in self.topics else []
-        own = {key: value for key, value in self.settings.items() if key not in without}
-        for key, value in (own | dict(more or {})).items():
+        for key, value in (self.assumed | dict(more)).items():
             words += ["--set", assignment(key, value)]
         return shlex.join([*words, *(("--out", str(suggested_out(self._path))) if name == "replay" else ())])
 
