@@ -24,7 +24,7 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, MapView
+from graph_slam_ros.slam import Config, Control, GraphSlam, MapView
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def of_robot(robot: int) -> Course:
         path = datasets.mrclam(robot, Path(folder) / "bag")
         bag, config = open_bag(path), Config.from_mapping({"map.condense": False})  # every sighting is wanted
         slam = GraphSlam(config)
-        for _, several in RecordedRuns(bag, choose_inputs(bag, config), config, Counters()):
+        for _, several in RecordedRuns(bag, choose_inputs(bag, config), config):
             for m in several:
                 slam.process(m)
         slam.process(Control("end"))

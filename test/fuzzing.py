@@ -30,7 +30,7 @@ from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.slam import Config, Counters
+from graph_slam_ros.slam import Config
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S, LIMIT_MIB = 5.0, 512
@@ -111,7 +111,7 @@ UNPACK = {"zstd": zstandard.decompress, "lz4": lz4.frame.decompress, "": bytes}
 def use_bag(path):
     """Every message through the border."""
     bag, config = open_bag(path), Config()
-    for _ in RecordedRuns(bag, choose_inputs(bag, config), config, Counters()):
+    for _ in RecordedRuns(bag, choose_inputs(bag, config), config):
         pass
     said = bag.losses + bag.warnings
     assert all(line.isprintable() for line in said), said

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.check.checks import refused_odometry, worst_of_replay
-from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.findings.finding import Finding
@@ -22,7 +21,7 @@ from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.runs.replay import Progress, RecordedRuns
 from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.runs.tables import account
-from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView
+from graph_slam_ros.slam import Config, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import CODES, Fitted, setting_of
 from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS, Parameter, parameters_of
 from graph_slam_ros.slam.noise.factors import FIRST_DUE
@@ -139,9 +138,8 @@ class _Rounds:
         """Replay the whole recording; anew where a fit after ``due``, 2, 4 times as many keyframes finds more."""
         while True:
             self.out.rounds += 1
-            config, counters = self._config.changed(self.out.settings), Counters()
-            slam, columns = GraphSlam(config), Collector(config, self._inputs.topics)
-            runs = RecordedRuns(self._bag, self._inputs, config, counters, columns=columns)
+            config = self._config.changed(self.out.settings)
+            slam, runs = GraphSlam(config), RecordedRuns(self._bag, self._inputs, config)
             for _, some in self._progress(runs, runs.count):
                 for one in some:
                     slam.process(one)
@@ -155,7 +153,7 @@ class _Rounds:
             slam.process(event)
         self.keyframes = len(slam.view.keyframes)
         if self.keyframes and due < math.inf:
-            read = columns.columns(counters)
+            read = runs.columns()
             self.out.fault = next(iter(refused_odometry(read)), None) or worst_of_replay(read)
         return slam
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.check.checks import check_columns, with_inputs
-from graph_slam_ros.check.columns import Collector, Columns
+from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.gyro import of_gyro_or_wheels
 from graph_slam_ros.check.moving_landmarks import moving_names, without
 from graph_slam_ros.check.trial import check_doubted, check_trial, replayed
@@ -21,7 +21,7 @@ from graph_slam_ros.overview.suggested_odometry import ODOMETRY
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import Progress, RecordedRuns
 from graph_slam_ros.runs.suggestion import OF_LANDMARKS, Suggestion
-from graph_slam_ros.slam import Config, Control, Counters
+from graph_slam_ros.slam import Config, Control
 from graph_slam_ros.warmup import warmup
 
 _UNNAMED_NS = 120_000_000_000
@@ -79,10 +79,9 @@ def check(
         return Checked(in_order(found), None, bag.losses, bag.warnings)
     config = Config.from_mapping(suggestion.assumed | settings)
     inputs = suggestion.inputs(config)
-    collector, counters = Collector(config, inputs.topics, suggestion.assumed), Counters()
-    runs = RecordedRuns(bag, inputs, config, counters, columns=collector)
+    runs = RecordedRuns(bag, inputs, config, assumed=suggestion.assumed)
     measured = [(number, some) for number, some in progress(runs, runs.count) if some and not quick]
-    columns = collector.columns(counters)
+    columns = runs.columns()
     found += [Finding("damaged", "error", 1, 0, "parts", loss) for loss in dict.fromkeys(bag.losses)]
     found += check_columns(columns)
     if not quick and not any(one.ends or one.forbids_replay for one in found):

@@ -1,16 +1,17 @@
 """Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import chain, groupby, islice
 from operator import attrgetter, itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from graph_slam_ros.check.checks import first_of_replay, worst_of_replay
-from graph_slam_ros.check.columns import Collector
+from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.measurements.types import END, Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF_STATIC, MessageConverter
@@ -59,11 +60,12 @@ class RecordedRuns:
     Parameters
     ----------
     datum : where on earth the map begins: latitude [deg], longitude [deg], height [m]; empty: at the first fix
-    columns : collects what the checks of a recording look into
+    assumed : parameters that were chosen for the recording
 
     Attributes
     ----------
     count : of the messages
+    counters : of what became of them
     counted : what was counted when each run but the last ended
     """
 
@@ -72,21 +74,21 @@ class RecordedRuns:
         bag: Bag,
         inputs: Inputs,
         config: Config,
-        counters: Counters,
         datum: tuple[float, ...] = (),
-        columns: Collector | None = None,
+        assumed: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        self._bag, self._inputs, self._counters, self._columns = bag, inputs, counters, columns
+        self._bag, self._inputs, self.counters = bag, inputs, Counters()
+        self._columns = Collector(config, inputs.topics, assumed)
         self._on_jump = config.time.on_jump
-        self._gate = IngestGate(counters)
+        self._gate = IngestGate(self.counters)
         self.count = sum(bag.topics[topic].count for topic in inputs.by_topic())
         self.counted: list[Counters] = []
         used = [bag.topics[topic] for topic in inputs.topics.values()]
         decoders = {topic.type: recorded_decoder(topic) for topic in used}
-        self._converter = MessageConverter(config, counters, decoders)
+        self._converter = MessageConverter(config, self.counters, decoders)
         self._converter.on_fault = bag.warnings.append
-        for name in counters.received.keys() - inputs.topics.keys():
-            del counters.received[name]  # nobody asked for it
+        for name in self.counters.received.keys() - inputs.topics.keys():
+            del self.counters.received[name]  # nobody asked for it
         if datum:
             self._converter.begin_at(datum)
 
@@ -112,14 +114,13 @@ class RecordedRuns:
         if len(messages) < _FEWEST or len(names) > 1:
             return []
         run = self._converter.convert_run(names[0], [m.cdr for m in messages], self._gate.newest_ns(names[0]))
-        if self._columns is not None and run:
+        if run:
             log_ns = [m.log_ns for m in messages[: len(run)]]
             self._columns.add_run(messages[0].topic, log_ns, run, self._converter.decoded)
         return run
 
     def _collect(self, message: BagMessage, names: Sequence[str], measured: list[Measured]) -> None:
-        if self._columns is not None:
-            self._columns.add(message.topic, names, message.log_ns, measured, self._converter.decoded)
+        self._columns.add(message.topic, names, message.log_ns, measured, self._converter.decoded)
 
     def _passed(self, measured: list[Measured], names: Sequence[str]) -> Iterator[tuple[int, list[Measured | Control]]]:
         passage = self._gate.admit(measured, self._on_jump)
@@ -131,15 +132,19 @@ class RecordedRuns:
             self.counted.append(self._counted_before(names))
         yield len(self.counted), [*passage.events, *passage.measured]
 
+    def columns(self) -> Columns:
+        """Return what the checks of a recording look into, of the messages until now."""
+        return self._columns.columns(self.counters)
+
     def counted_in(self, number: int) -> Counters:
         """The counts of one run, by its number; of the last run, until now."""
-        end = self.counted[number] if number < len(self.counted) else self._counters
+        end = self.counted[number] if number < len(self.counted) else self.counters
         return end.since(self.counted[number - 1] if number else Counters())
 
     def _counted_before(self, names: Sequence[str]) -> Counters:
         """The counts before a message of these inputs that belongs to the next run."""
         before = Counters()
-        before.update(self._counters)
+        before.update(self.counters)
         before.received.subtract(names)
         return before
 
@@ -201,12 +206,11 @@ def replay(
     config = with_survey(config or Config())
     bag = open_bag(source)
     inputs = choose_inputs(bag, config, odometry, landmarks)
-    columns, counters = Collector(config, inputs.topics), Counters()
-    runs = RecordedRuns(bag, inputs, config, counters, state.datum if state is not None else (), columns)
+    runs = RecordedRuns(bag, inputs, config, state.datum if state is not None else ())
     bag.losses += losses
     read = iter(runs)
     ahead, end = list(islice(read, _READ_AHEAD)), ((len(runs.counted), [event]) for event in END)
-    if found := first_of_replay(columns.columns(counters), is_whole=len(ahead) < _READ_AHEAD):
+    if found := first_of_replay(runs.columns(), is_whole=len(ahead) < _READ_AHEAD):
         warn(f"the result will mean nothing: {found.code}: {found.text}")
     warmup(dimensions=config.world.dimensions)
     earlier: list[tuple[Path, dict[str, Any]]] = []
@@ -228,7 +232,7 @@ def replay(
             border=partial(runs.counted_in, number),
             took=took,
             recording=source.resolve().name,
-            more=lambda: _checked(columns, counters, bag),
+            more=lambda: _checked(runs, bag),
             force=force,
         )
         warnings += _warnings(slam.view, summary)
@@ -255,9 +259,9 @@ def _again(
     return Replayed(slam, summary, summary["losses"], _warnings(slam.view, summary))
 
 
-def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]:
+def _checked(runs: RecordedRuns, bag: Bag) -> dict[str, Any]:
     """The worst finding of the recording so far, from the checks that need no fit."""
-    found = worst_of_replay(columns.columns(counters), is_damaged=bool(bag.losses))
+    found = worst_of_replay(runs.columns(), is_damaged=bool(bag.losses))
     return {} if found is None else {"check": found.as_dict()}
 
 

@@ -84,11 +84,12 @@ def fixes_of(recording, path, name):
     write_bag(recording, path)
     dimensions = space_of(recording.T_world_base[0]).dimensions
     settings = {"inputs.names": f"odom {name}", name: INPUTS[name], "world.dimensions": dimensions}
-    config, bag, counters = Config.from_mapping(settings), open_bag(path), Counters()
-    several = [m for _, some in RecordedRuns(bag, choose_inputs(bag, config), config, counters) for m in some]
+    config, bag = Config.from_mapping(settings), open_bag(path)
+    runs = RecordedRuns(bag, choose_inputs(bag, config), config)
+    several = [m for _, some in runs for m in some]
     fixes = [m for m in several if isinstance(m, Fix)]
     at = np.searchsorted(recording.stamps_ns, [m.stamp_ns for m in fixes])
-    return fixes, counters, se3.in_space(recording.T_world_base)[at]
+    return fixes, runs.counters, se3.in_space(recording.T_world_base)[at]
 
 
 @pytest.mark.parametrize("world", ["warehouse", "flight"])

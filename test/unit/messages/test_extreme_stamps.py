@@ -25,7 +25,7 @@ from graph_slam_ros.messages import to_msg
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam
 
 S = 1_000_000_000
 FIX = "sensor_msgs/msg/NavSatFix"
@@ -59,14 +59,14 @@ def drive(tmp_path_factory):
 
 
 def run(bag):
-    counters, slam = Counters(), GraphSlam(CONFIG)
-    for _, some in RecordedRuns(bag, choose_inputs(bag, CONFIG), CONFIG, counters):
+    slam, runs = GraphSlam(CONFIG), RecordedRuns(bag, choose_inputs(bag, CONFIG), CONFIG)
+    for _, some in runs:
         for m in some:
             slam.process(m)
     for event in ("end", "optimize"):
         slam.process(Control(event))
-    counters.update(slam.counters)
-    return slam, counters.as_dict()
+    runs.counters.update(slam.counters)
+    return slam, runs.counters.as_dict()
 
 
 @pytest.fixture(scope="module")
