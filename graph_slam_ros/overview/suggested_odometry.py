@@ -50,10 +50,8 @@ class OdometryChoice:
         self.topic = ""
         self.contents: TopicContents | None = None
         self.base, self.odom = "base_link", "odom"
-        self.trouble = "" if self._of_topics() or self._of_tf() or self._of_poses() else self._nothing()
-
-    def _of_topics(self) -> bool:
-        return self._best_of(list(self._candidates(ODOMETRY)))
+        is_found = self._best_of(list(self._candidates(ODOMETRY))) or self._of_tf() or self._of_poses()
+        self.trouble = "" if is_found else self._nothing()
 
     def _candidates(self, *types: str) -> Iterator[TopicContents]:
         """Topics of some types that may be odometry."""

@@ -198,8 +198,11 @@ class Suggestion:
 
     def _choose_fixes(self) -> None:
         receivers = sorted(readable(self._recording, self.unused, GNSS), key=lambda one: -one.usable)
-        if receivers and receivers[0].usable:
-            self._receiver(receivers[0])
+        if receivers and (best := receivers[0]).usable:
+            self._add("gps", best, {} if best.has_noise else {"sigma_m": 2.0}, linked=True)
+            self._mount(best.topic.name, best.frame)  # says what is assumed; the input itself assumes and counts it
+            if not best.has_noise:
+                self.notes.append(f"{best.topic.name} has no covariance: 2 m is assumed")
         for one in receivers[1:]:
             self.unused[one.topic.name] = "another receiver"
         self._choose_imu(readable(self._recording, self.unused, IMU), is_needed=len(self.names) == 1)
@@ -207,12 +210,6 @@ class Suggestion:
             is_landmark, is_odometry = bool(self._tag_number(one)), one.topic.name == self.topics.get("odom")
             if not (is_landmark or is_odometry):
                 self._pose(one)
-
-    def _receiver(self, one: TopicContents) -> None:
-        self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
-        self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
-        if not one.has_noise:
-            self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
 
     def _pose(self, one: TopicContents) -> None:
         name, noise = one.topic.name, {} if one.has_noise else {"sigma_m": 0.1}

@@ -170,7 +170,8 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     used_as = dict.fromkeys(view.odometry_sources, "odometry") | recorded_uses(view.config)  # sources may be no inputs
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
     newest_drive = 0 if is_of_map or not view.drives else view.drives[-1]
-    accepted = _accepted_by_input(view, newest_drive)
+    edges = view.graph.edge_ids.since()
+    accepted, _ = _by_input(view, np.delete(edges, np.flatnonzero(view.ledger.keyframe.values < newest_drive)))
     for drive, condensed in (view.bounded.accepted if view.bounded else {}).items():
         if drive >= newest_drive:
             accepted.update(condensed)
@@ -212,12 +213,6 @@ def accepted_lately(view: MapView) -> dict[str, tuple[int, int]]:
     """Return by input how many of its edges among the newest of the graph are believed, and how many there are."""
     accepted, judged = _by_input(view, view.graph.edge_ids.since()[-_LATELY:])
     return {name: (accepted[name], times) for name, times in judged.items()}
-
-
-def _accepted_by_input(view: MapView, first: int) -> Counter[str]:
-    """Accepted edges of landmarks, fixes and closures by input that were judged first at a keyframe or later."""
-    edges, ledger = view.graph.edge_ids.since(), view.ledger
-    return _by_input(view, np.delete(edges, np.flatnonzero(ledger.keyframe.values < first)))[0]
 
 
 def _by_input(view: MapView, edges: Index) -> tuple[Counter[str], Counter[str]]:
