@@ -86,8 +86,7 @@ def fixes_of(recording, path, name):
     settings = {"inputs.names": f"odom {name}", name: INPUTS[name], "world.dimensions": dimensions}
     config, bag = Config.from_mapping(settings), open_bag(path)
     runs = RecordedRuns(bag, choose_inputs(bag, config), config)
-    several = [m for _, some in runs for m in some]
-    fixes = [m for m in several if isinstance(m, Fix)]
+    fixes = [m for _, some in runs for m in some if isinstance(m, Fix)]
     at = np.searchsorted(recording.stamps_ns, [m.stamp_ns for m in fixes])
     return fixes, runs.counters, se3.in_space(recording.T_world_base)[at]
 
