@@ -153,7 +153,7 @@ $(VENV)-docs/stamp: docs/requirements.txt setup.py setup.cfg pyproject.toml
 	@touch $@
 
 site: $(VENV)-docs/stamp
-	$(VENV)-docs/bin/sphinx-build --quiet --fail-on-warning -d $(VENV)-docs/doctrees docs site
+	$(VENV)-docs/bin/sphinx-build --quiet --fresh-env --fail-on-warning -d $(VENV)-docs/doctrees docs site
 
 $(VENV)-bench/stamp: benchmarks/requirements.txt setup.py setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)-bench

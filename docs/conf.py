@@ -42,8 +42,9 @@ numpy.typing.NDArray, numpy.typing.ArrayLike = Array, ArrayLike
 
 
 def _read(app: Sphinx, page: str, source: list[str]) -> None:
-    """Lead links to files outside of docs/ into the repository; the front page is README, and the list of pages."""
+    """Lead links to folders, and out of docs/, into the repository; the front page is README, and the list of pages."""
     text = source[0].replace("](../", f"]({_FILES}/")
+    text = re.sub(r"\]\((\w+/?)\)", rf"]({_FILES}/docs/\1)", text)
     if page == "index":
         pages = "\n".join(re.findall(r"\]\((\w+)\.\w+\)", text))
         readme = re.sub(r'(\]\(|src=")docs/', r"\1", _README.partition("\n## Documentation")[0])
