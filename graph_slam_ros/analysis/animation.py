@@ -44,7 +44,7 @@ def animate_run(
 
     Returns what of the drive could not be read, a line each.
 
-    Raises GraphSlamError: a file that is missing or unreadable, or that cannot be written.
+    Raises GraphSlamError: a file that is missing or unreadable; OSError: it cannot be written.
 
     Dead reckoning is black and begins where the estimate does; the estimate is red; truth is blue, laid on the whole
     path. A loop closure is seen as the moment at which the red path moves. The last frame is the solved graph.
@@ -69,10 +69,7 @@ def animate_run(
     images[0].save(
         drawn, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True
     )
-    try:
-        write_whole(out_gif, drawn.getvalue())
-    except OSError as error:
-        raise GraphSlamError(f"{out_gif}: {error.strerror or error}") from None
+    write_whole(out_gif, drawn.getvalue())
     return losses
 
 

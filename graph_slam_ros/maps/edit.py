@@ -147,10 +147,7 @@ def write_empty_plan(folder: Path, file: Path) -> None:
     """Write a plan without edits for a run, to be filled. Raises GraphSlamError where something is there already."""
     if os.path.lexists(file):
         raise GraphSlamError(f"{file}: exists already: choose another name")
-    try:
-        write_whole(file, plan_text(Plan(source_hash(folder), ())).encode())
-    except OSError as error:
-        raise GraphSlamError(f"{file}: {error.strerror}") from None
+    write_whole(file, plan_text(Plan(source_hash(folder), ())).encode())
 
 
 def read_plan(file: Path) -> Plan:
@@ -175,22 +172,6 @@ def plan_of(text: str) -> Plan:
         content = json.loads(text, object_pairs_hook=_without_repeats, parse_constant=_no_number)
     except (ValueError, RecursionError, FormatError) as error:
         raise FormatError(f"not JSON: {error}") from None
-    return _plan(content)
-
-
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    out = dict(pairs)
-    if len(out) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise FormatError(f"key {shortened(next(n for n in names if names.count(n) > 1))} is there twice")
-    return out
-
-
-def _no_number(word: str) -> Any:
-    raise FormatError(f"{word} is not a finite number")
-
-
-def _plan(content: Any) -> Plan:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise FormatError(f'not a plan of edits: no "format": "{FORMAT}"')
     for key in content:
@@ -204,6 +185,18 @@ def _plan(content: Any) -> Plan:
     if not isinstance(edits, list) or len(edits) > _MOST_EDITS:
         raise FormatError(f"edits: {shortened(edits)} is not a list of at most {_MOST_EDITS} edits")
     return Plan(source, _edits(edits))
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise FormatError(f"key {shortened(next(n for n in names if names.count(n) > 1))} is there twice")
+    return out
+
+
+def _no_number(word: str) -> Any:
+    raise FormatError(f"{word} is not a finite number")
 
 
 def _edits(several: Sequence[Any]) -> tuple[Edit, ...]:

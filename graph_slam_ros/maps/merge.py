@@ -51,8 +51,17 @@ def aligned_for_merge(one: MapView, two: MapView, a: Path, b: Path) -> tuple[lis
 
     Raises GraphSlamError: they cannot become one map.
     """
-    _refuse_other_datum(one, two, a, b)
-    _refuse_same_drive(one, two, a, b)
+    if one.datum and two.datum and one.datum != two.datum:
+        raise GraphSlamError(
+            f"fixes of {a} are from {one.datum}, of {b} from {two.datum}: configure one datum for both"
+        )
+    driven, again = (
+        {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
+        for path in (WholePath.of(one, a), WholePath.of(two, b))
+    )
+    same = len(driven & again)
+    if same > 1:  # two robots may begin at one time
+        raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
     shared = _shared(one, two, a, b)
     return shared, _aligned(one, two, shared)
 
@@ -64,23 +73,6 @@ def merge_trouble(one: MapView, two: MapView, a: Path, b: Path) -> str:
     except GraphSlamError as error:
         return str(error)
     return ""
-
-
-def _refuse_other_datum(one: MapView, two: MapView, a: Path, b: Path) -> None:
-    if one.datum and two.datum and one.datum != two.datum:
-        raise GraphSlamError(
-            f"fixes of {a} are from {one.datum}, of {b} from {two.datum}: configure one datum for both"
-        )
-
-
-def _refuse_same_drive(one: MapView, two: MapView, a: Path, b: Path) -> None:
-    driven, again = (
-        {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
-        for path in (WholePath.of(one, a), WholePath.of(two, b))
-    )
-    same = len(driven & again)
-    if same > 1:  # two robots may begin at one time
-        raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
 
 
 def _shared(one: MapView, two: MapView, a: Path, b: Path) -> list[str]:
