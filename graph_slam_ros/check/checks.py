@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.columns import MOST, Columns
 from graph_slam_ros.check.contradictions import check_contradictions
 from graph_slam_ros.check.fixes import check_fixes
 from graph_slam_ros.check.frames import check_frames
@@ -15,7 +15,6 @@ from graph_slam_ros.check.times import check_times, rounded_s
 from graph_slam_ros.findings.finding import Finding, Severity, in_order
 from graph_slam_ros.findings.table import Effect, explain
 
-_MOST = 0.5  # part of the messages: with more refused, a replay means nothing
 _USUAL = {  # of single messages: detectors err, and a recording begins and ends somewhere
     *("zero_stamp", "no_id", "late", "before_odometry", "after_odometry", "overhead", "beyond_max_distance"),
     *("no_fix", "no_result", "other_publisher", "future", "far_in_time", "id_conflict", "poor_tag"),
@@ -45,7 +44,7 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
             received = max(c.counters.received[source], items.get(source, 0) + times, times)
             share = times / received
             limit = _USUAL_SHARE if reason in _USUAL else 0.0
-            severity: Severity = "error" if share > _MOST and is_lost else "warning" if share > limit else "note"
+            severity: Severity = "error" if share > MOST and is_lost else "warning" if share > limit else "note"
             text = f"{source}: {times} of {received}{' are refused' * is_lost}: {row.meaning}"
             stated = "odometry.noise=density" if is_odometry else f"{source}.noise=sigmas"
             settings = (stated,) if reason in _OF_COVARIANCE and (is_odometry or source in items) else ()
@@ -60,7 +59,7 @@ def check_unnamed(c: Columns) -> Iterator[Finding]:
             continue
         unnamed = s.name == s.names.index("")
         share = float(np.mean(unnamed))
-        severity: Severity = "error" if share > _MOST else "warning" if share > _USUAL_SHARE else "note"
+        severity: Severity = "error" if share > MOST else "warning" if share > _USUAL_SHARE else "note"
         text = f"{share:.1%} of the sightings have no id, and are not used"
         of_unnamed = s.some(unnamed)
         yield of_unnamed.finding("no_id", severity, share, _USUAL_SHARE, "part", text, settings=_JOINT)

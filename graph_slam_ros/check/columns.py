@@ -24,7 +24,8 @@ from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount, pose
 from graph_slam_ros.typing import Array, Index, Mask
 
-_MOST = 200_000  # messages of each topic that are collected
+MOST = 0.5  # part of all: more are most of them
+_KEPT = 200_000  # messages of each topic that are collected
 _TWIST = (0, 7, 14, 21, 28, 35)  # places in a covariance
 _UNKNOWN_M = 30.0  # so large is the sigma of an axis that a detector does not know
 SomeTopicData = TypeVar("SomeTopicData", bound="TopicData")
@@ -206,7 +207,7 @@ def in_order(path_ns: Index, path: Array) -> tuple[Index, Array]:
 
 
 class _Rows:
-    """Rows of some whole numbers and some others, up to ``_MOST``."""
+    """Rows of some whole numbers and some others, up to ``_KEPT``."""
 
     def __init__(self, whole: int, others: int) -> None:
         self._sizes, self._whole, self._others = (whole, others), array("q"), array("d")
@@ -217,7 +218,7 @@ class _Rows:
     @property
     def room(self) -> int:
         """The number of rows that may still be added."""
-        return _MOST - len(self)
+        return _KEPT - len(self)
 
     def add(self, whole: Iterable[int], others: Iterable[float] = ()) -> None:
         """Add one or more rows, for which there is room."""

@@ -6,10 +6,11 @@ from operator import itemgetter
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.columns import MOST, Columns, SightingColumns
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
 from graph_slam_ros.check.odometry import fitted, twist_factor
 from graph_slam_ros.check.pairs import (
+    HALF,
     LATER_S,
     LEAST_TURNED,
     TURNED_RAD,
@@ -29,12 +30,12 @@ from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST_PAIRS = 30
 _FAR_M = 200.0  # the farthest of tags, cones and poles that a robot sees
-_HALF, _FIFTH = 0.5, 0.2  # of the residuals now: another explanation is right, one is right whatever the noise
+_FIFTH = 0.2  # of the residuals: another explanation is right, whatever the noise
 _NOISES, _NEAR_M = 2.0, 0.3  # residuals that need no other explanation: times their noise, and whatever it is
 _NEARLY, _RELATED = 1.2, 0.7  # times the best of others, or of chance: no better than these
 _UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100  # part of the motion, more than noise, by so many
 _TWICE, _NO_IDS = 0.002, 0.2  # part of the sightings: ids that are there twice, and are none
-_MOST, _SELDOM = 0.5, 3  # part of the drive without a sighting, or of the ids that are seen less often
+_SELDOM = 3  # sightings of an id
 _AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25  # a landmark that comes back, and the part of a drive that one is to span
 _CHANCE, _MOST_BY_CHANCE = 0.02, 2  # part of the landmarks, and of many: all ids change, but these
 _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of the drive
@@ -116,7 +117,7 @@ def _of_others(points: Array, pairs: Pairs, use: Mask) -> float:
 
 def _explains(if_so_m: float, now_m: float, noise_m: float) -> bool:
     """Return whether sightings agree so much better that noise is no cause, even one that is stated too large."""
-    return if_so_m < _FIFTH * now_m or (if_so_m < _HALF * now_m and now_m > _NOISES * noise_m)
+    return if_so_m < _FIFTH * now_m or (if_so_m < HALF * now_m and now_m > _NOISES * noise_m)
 
 
 def _mounts(s: SightingColumns) -> dict[str, se3.Pose]:
@@ -176,7 +177,7 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
         return None
     apart = f"two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m"
     text = f"in turns, {apart} if {what}"
-    return s.finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, len(pairs.a))
+    return s.finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / HALF, "times", text, len(pairs.a))
 
 
 def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Finding | None:
@@ -202,7 +203,7 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Findin
     is_all = best_m < _NOISES * noise_m  # else another mount is right
     settings = turned_mount(s.input, s.frame, mounts[what], se3.IDENTITY) if is_all and what in mounts else ()
     value = now_m / max(best_m, 1e-9)
-    return s.finding("axes", "error", value, 1.0 / _HALF, "times", text, len(pairs.a), settings=settings)
+    return s.finding("axes", "error", value, 1.0 / HALF, "times", text, len(pairs.a), settings=settings)
 
 
 def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
@@ -217,13 +218,13 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
     x = (s.points[pairs.a] - after)[:, :n] + turned
     (drive, swing), sigma = fitted(np.stack([moved.ravel(), turned.ravel()], axis=1), x.ravel())
     left, size = (np.median(np.linalg.norm(some, axis=1)) for some in (x - drive * moved - swing * turned, x))
-    if len(s.names) == 1 or left > _HALF * size or drive <= 0.0 or abs(drive - 1.0) < _OTHER_SCALE:
+    if len(s.names) == 1 or left > HALF * size or drive <= 0.0 or abs(drive - 1.0) < _OTHER_SCALE:
         return None
     doubt = _SIGMAS * sigma + _PLACE_M / max(float(np.hypot(*s.T_base_frame[:2])), 1e-9)
     if any(len(f.points) and np.abs(f.points - f.points[0]).max() > _FIXED * max(f.sigma_m, 1.0) for f in c.fixes):
         swing, doubt = drive, 0.0  # which agree with odometry: else nothing was asked of landmarks
     of_odometry, of_ranges = abs(swing - 1.0), abs(swing - drive)  # the place of the sensor is in metres
-    is_told = min(of_odometry, of_ranges) + doubt < _HALF * max(of_odometry, of_ranges)
+    is_told = min(of_odometry, of_ranges) + doubt < HALF * max(of_odometry, of_ranges)
     now = next((one.range_factor for one in c.config.sources if one.name == s.input), 1.0)
     scale, o = c.config.odometry.distance_factor, c.odometry
     by_ranges = factor_setting(f"{s.input}.range_factor", now / drive, 10.0)
@@ -275,9 +276,9 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
     between = np.diff([0, *np.searchsorted(path_ns, np.sort(s.stamp_ns[inside])), len(path_ns)])
     silent = float(between.max()) / len(path_ns)
-    if silent > _MOST:
+    if silent > MOST:
         text = f"nothing is seen for {silent:.0%} of the drive, for {int(between.max())} poses of odometry"
-        yield s.finding("silent", "warning", silent, _MOST, "part", text)
+        yield s.finding("silent", "warning", silent, MOST, "part", text)
     chosen = np.flatnonzero(s.named(path_ns))
     if not len(chosen):
         return
@@ -285,9 +286,9 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     is_same = np.diff(s.name[order]) == 0
     first, last = (np.flatnonzero(np.concatenate(ends)) for ends in (([True], ~is_same), (~is_same, [True])))
     seldom = float((last - first + 1 < _SELDOM).mean())
-    if seldom > _MOST:
+    if seldom > MOST:
         text = f"{seldom:.0%} of {len(first)} ids are seen less than {_SELDOM} times"
-        yield s.finding("seen_once", "warning", seldom, _MOST, "part", text)
+        yield s.finding("seen_once", "warning", seldom, MOST, "part", text)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds, at_s = ((stamp_ns - path_ns[0]) * 1e-9 for stamp_ns in (path_ns, s.stamp_ns[order]))
     at_m = np.interp(at_s, seconds, driven)

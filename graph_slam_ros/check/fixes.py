@@ -8,14 +8,14 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, FixColumns
 from graph_slam_ros.check.contradictions import factor_setting, turned_mount
 from graph_slam_ros.check.odometry import TOGETHER, worst_stretch
-from graph_slam_ros.check.pairs import poses_at
+from graph_slam_ros.check.pairs import HALF, poses_at
 from graph_slam_ros.check.times import MOST_LATE_S, offset_setting
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.typing import Array, Index
 
 _LEAST, _STEP_M, _SIGMAS = 8, 2.0, 6.0  # fixes, and how far apart those are whose motion is compared: m, sigmas
-_TURNED_RAD, _HALF = 0.2, 0.5  # of steps that tell a mirror, and what is left of their differences with it
+_TURNED_RAD = 0.2  # of steps that tell a mirror
 _SCALE, _OFF = 1.5, 0.1  # times: no odometry is so wrong; part of its distances that a fit leaves, or is off by
 _SAME_M, _FAR_M = 1e-6, 3.0  # of a fix that stands, and what nobody takes for noise
 _STEP_S, _SLIP_M, _SLIP_PART, _SLIP_SIGMAS = 2.0, 2.0, 0.25, 5.0  # a step, and the least of five: of it, of the usual
@@ -89,7 +89,7 @@ def _turned(c: Columns, f: FixColumns, own: Array) -> Iterator[Finding]:
         ways, own_ways = (np.stack([some.real, some.imag], axis=1) for some in (moved, driven))
         linear, left, *_ = np.linalg.lstsq(own_ways, ways, rcond=None)  # degrees of latitude and longitude differ
         is_linear = left.sum() < _OFF * np.sum(ways**2)
-        if (mirrored < _HALF * now and now > _TURNED_RAD) or (is_linear and np.linalg.det(linear) < 0.0):
+        if (mirrored < HALF * now and now > _TURNED_RAD) or (is_linear and np.linalg.det(linear) < 0.0):
             what = "latitude and longitude, or east and north, are exchanged, or odometry's position is mirrored"
             text = f"fixes turn right where odometry turns left: {what}"
             yield f.finding("fix_mirrored", "error", now, mirrored, "rad", text, settings=(f"{f.input}.use=none",))
@@ -164,18 +164,18 @@ def _headings(f: FixColumns, yaws: Array, known: tuple[Index, Array] | None) -> 
     now, mirrored = _mirrored(*steps)
     if now > _TURNED_RAD:
         turned, own = (float(np.abs(some).sum()) for some in steps)
-        is_faulty = mirrored < _HALF * now or not _STANDS * own < turned < _SPINS * own
+        is_faulty = mirrored < HALF * now or not _STANDS * own < turned < _SPINS * own
         mirror = "turns to the right where odometry turns to the left: it counts clockwise (NED)"
         other = f"turns {turned:.1f} rad where odometry turns {own:.1f} rad: "
         other += "does it stand, or is it in degrees?" if is_faulty else "which of them is right?"
-        code, what = ("heading_clockwise", mirror) if mirrored < _HALF * now else ("unrelated", other)
+        code, what = ("heading_clockwise", mirror) if mirrored < HALF * now else ("unrelated", other)
         settings, limit = (f"{f.input}.use=none",) * is_faulty, min(mirrored, _TURNED_RAD)
         yield f.finding(code, "error", now, limit, "rad", f"its heading {what}", settings=settings)
     elif known is not None:
         near = np.clip(np.searchsorted(f.stamp_ns, known[0]), 0, len(yaws) - 1)
         turned = np.exp(1j * (f.headings[near] - yaws[near] - known[1]))
         off = float(np.angle(np.median(turned.real) + 1j * np.median(turned.imag)))
-        if abs(off) > _OFF_RAD and np.median(np.abs(np.angle(turned * np.exp(-1j * off)))) < _HALF * abs(off):
+        if abs(off) > _OFF_RAD and np.median(np.abs(np.angle(turned * np.exp(-1j * off)))) < HALF * abs(off):
             text = f"its heading is {np.degrees(off):.0f} degrees off the course of the fixes (0 is east)"
             quarter = round(off / (0.5 * np.pi)) * 0.5 * np.pi
             off = quarter if abs(off - quarter) < _OFF_RAD else off

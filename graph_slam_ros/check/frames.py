@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.columns import MOST, Columns, SightingColumns
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
@@ -90,7 +90,7 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
             text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
         elif linked:  # a mount is not used for them
             text = f"{times} measurements are refused: they come before /tf links {others} to {base}"
-        severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
+        severity: Severity = "error" if times > MOST * max(c.counters.received[source], 1) else "warning"
         yield topic.finding("frame_unlinked", severity, times, 0, "measurements", text, times, settings=settings)
     key = f"{c.odometry.input}.mount"
     if key in c.assumed:

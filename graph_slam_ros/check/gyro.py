@@ -8,7 +8,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.contradictions import turned_mount
-from graph_slam_ros.check.odometry import fitted
+from graph_slam_ros.check.odometry import SCALE, fitted
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import MOST_LATE_S, offset_setting
 from graph_slam_ros.findings.finding import Finding, Severity
@@ -18,7 +18,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3  # in which both turn, how many, and samples in each
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10  # windows in which the robot turns
-_SCALE, _GROSS, _BIAS_SIGMAS = 0.1, 0.4, 3.0  # of a factor that is wrong, and of another cause than the track width
+_GROSS, _BIAS_SIGMAS = 0.4, 3.0  # of a factor: the track width is no cause
 _UNEXPLAINED = 0.5  # part of the turns, or of a wrong heading: more is left where another cause is
 _OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but others
 _EITHER = ": the track width is wrong, or the scale of the gyro"
@@ -40,7 +40,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         size = max(1.0, abs(factor)) * float(np.median(np.abs(odometry[is_turning])))
         unexplained = float(np.median(np.abs(left[is_turning]))) / size
         most = _UNEXPLAINED if abs(factor) > _GROSS else _OF_NOTHING
-        if (unexplained > most or abs(factor - 1.0) > _SCALE) and (late_s := _late_s(c)):
+        if (unexplained > most or abs(factor - 1.0) > SCALE) and (late_s := _late_s(c)):
             when = f"{abs(late_s) * 1e3:.0f} ms {'later' if late_s < 0.0 else 'earlier'} than stamped"
             mend = (offset_setting(c, c.config.gyro_input, -late_s),)
             text = f"its gyro turns as odometry does {when}: correct its clock"
@@ -50,7 +50,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
             text = f"odometry's turns do not explain {unexplained:.0%} of those of the gyro"
             yield topic.finding("gyro_unrelated", "warning", unexplained, most, "part", text)
             return
-        if abs(factor - 1.0) > _SCALE:
+        if abs(factor - 1.0) > SCALE:
             yield _scale(c, factor, topic)
             if abs(factor - 1.0) >= _GROSS:  # its offset means nothing
                 return
@@ -115,7 +115,7 @@ def _scale(c: Columns, factor: float, topic: TopicColumns) -> Finding:
         text += ": are these degrees?"
         settings = (assignment(f"{c.config.gyro_input}.use", "none"),)
     severity: Severity = "warning" if abs(factor - 1.0) < _GROSS else "error"
-    return topic.finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, settings=settings)
+    return topic.finding("gyro_scale", severity, factor, 1.0 + SCALE, "times", text, settings=settings)
 
 
 def upright(felt: Numbers) -> tuple[float, float]:

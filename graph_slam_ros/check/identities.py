@@ -11,13 +11,13 @@ import numpy as np
 from graph_slam_ros.check.columns import SightingColumns
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.findings.finding import Finding, Severity
+from graph_slam_ros.slam.levels import SIGMAS
 from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST, _IN_EACH, _PART = 12, 5, 0.05  # sightings of an id, and at each of its places
 _APART_M, _SIGMAS, _WIDTHS = 0.5, 8.0, 6.0  # between both places, at least: of a sighting, of what lies around them
 _ROUNDS, _QUANTILE, _FIRST = 10, 95.0, 6  # of two medians; percent that are no outliers; one part that is the first
 _IN_TURN, _EXCHANGED, _MOST_MOVED = 0.9, 0.4, 3  # part on one side of a cut; of the way between two; landmarks
-_FAR_SIGMAS = 4.0  # of an outlier, whose landmark is seen as often as a place
 _OUTLIERS, _NOTED = 0.12, 0.02  # part of the sightings: a run leaves out a few that contradict its map
 
 
@@ -145,7 +145,7 @@ def check_outliers(s: SightingColumns, points: Array, inside: Mask, dimensions: 
         if name and len(own) >= _IN_EACH:
             away = np.linalg.norm(at[own] - np.median(at[own], axis=0), axis=1)
             spread = float(np.median(away)) / quantile(0.5, 1) ** 0.5
-            far[own] = away > np.maximum(_APART_M, _FAR_SIGMAS * np.maximum(s.sigmas[own], spread))
+            far[own] = away > np.maximum(_APART_M, SIGMAS * np.maximum(s.sigmas[own], spread))
             compared += len(own)
     if (count := int(far.sum())) > _NOTED * compared:
         share, first_ns = count / compared, int(s.stamp_ns[far].min())

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.pairs import Pairs, noise_of, pairs_of, poses_at
+from graph_slam_ros.check.pairs import HALF, Pairs, noise_of, pairs_of, poses_at
 from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST_PAIRS, _LEAST_NAMES = 10, 3  # of a landmark; landmarks of a fixed frame
-_NOISES, _HALF = 4.0, 0.5  # by which a landmark moves on the ground; of that, on the robot that carries it
+_NOISES = 4.0  # by which a landmark moves on the ground; HALF of that on the robot that carries it
 _MOST, _SOME = 0.8, 0.3  # part of the pairs of one landmark that moves; part of the landmarks that may
 _TIMES, _NEARLY_ALL = 3.0, 0.9  # as far as this part of the others
 _MOST_NAMED, _SAMPLED, _ABOUT_NS = 5, 60, 10_000_000_000  # findings; sightings about which, and for so long, one stays
@@ -56,7 +56,7 @@ def motions_of(c: Columns, s: SightingColumns, pairs: Pairs) -> LandmarkMotions:
     at = np.array([np.median(s.points[pairs.a[k]], axis=0) for k in chosen]).reshape(-1, 3)
     staying = np.array([_staying(s.stamp_ns[s.name == k], ground[s.name == k], 2.0 * noise_m) for k in names])
     moves = (on_ground > _NOISES * noise_m) & (moving > _MOST)
-    with_robot = moves & (on_robot < _HALF * on_ground)
+    with_robot = moves & (on_robot < HALF * on_ground)
     by_itself = moves & ~with_robot & (staying < _SOME)
     return LandmarkMotions(names, on_robot, on_ground, at, with_robot, by_itself, noise_m)
 
@@ -77,7 +77,7 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
         text = f"while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and would "
         text += f"move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
         times = ground_m / max(robot_m, 1e-9)
-        yield s.finding("seen_in_fixed_frame", "error", times, 1.0 / _HALF, "times", text, count)
+        yield s.finding("seen_in_fixed_frame", "error", times, 1.0 / HALF, "times", text, count)
         return
     for k in moving_alone(by)[:_MOST_NAMED]:
         name, own_ns = s.names[by.names[k]], np.sort(s.stamp_ns[s.name == by.names[k]])

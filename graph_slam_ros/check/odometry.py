@@ -26,14 +26,15 @@ _FEW, _FEW_JUMPS, _MANY = 0.01, 5.0, 0.1  # steps that may be jumps: a share, so
 _CORRECTED = 3  # jumps: a driver that restarts, or is lifted, makes fewer
 _LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: times the fastest, and at least
 _IRREGULAR = 2.5  # spread of the times between messages, in medians; 3.2 where they come at random
-_AT_ZERO, _AWAY_M = 1e-9, 0.5  # of a driver that was restarted: m and rad, and where it was before
+_AT_ZERO = 1e-9  # m and rad: of a driver that was restarted
 _STILL_M, _STILL_RAD = 0.5, 1.0  # of a whole drive
 _NO_TURN_RAD, _TURNS = 1e-6, 0.2  # _TURNS: of a quaternion's numbers
 _BENDS = 0.05  # of the squares of a way, those across it
 _SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
 _WINDOW_S, _LONGEST_S = 1.0, 3.0  # over which pose and twist are compared, and with a gap
 _LEAST_WIDTH = 4  # messages in a window: between fewer, the speed may be any
-_SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7  # of a factor, and what it leaves: clearly explained, or clearly not
+SCALE = 0.1  # of a factor: less is no other unit
+_EXPLAINED, _UNEXPLAINED = 0.5, 0.7  # of what a factor leaves: clearly explained, or clearly not
 _AT_REST = 0.05  # of the root mean square
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02  # sideways by ahead; of what is left, and that
 _TINY, _USELESS, _SLOWEST_M_S = 1e-3, 3.0, 0.05  # sigmas by the fastest speed, and what that is at least
@@ -239,7 +240,7 @@ def _drives_sideways(o: OdometryColumns) -> bool:
 
 def _jumps(steps: Steps, jumps: Mask, max_speed_m_s: float) -> Iterator[Finding]:
     poses = steps.of.poses
-    at_zero = (np.abs(poses[1:, :6]) < _AT_ZERO).all(axis=1) & (np.linalg.norm(poses[:-1, :3], axis=1) > _AWAY_M)
+    at_zero = (np.abs(poses[1:, :6]) < _AT_ZERO).all(axis=1) & (np.linalg.norm(poses[:-1, :3], axis=1) > _STILL_M)
     for code, is_there in (("odometry_reset", at_zero), ("odometry_jumps", jumps & ~at_zero)):
         count = int(is_there.sum())
         if not count:
@@ -299,12 +300,12 @@ def _twist(steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:
         total = np.abs(way).sum()
         if total < 1.0 or not np.isfinite(factor):
             continue
-        unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "")
-        is_other = min(abs(factor - 1.0), abs(applied * factor - 1.0)) > _SCALE
+        unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < SCALE), "")
+        is_other = min(abs(factor - 1.0), abs(applied * factor - 1.0)) > SCALE
         if is_other and left < _EXPLAINED and (unit or width >= _LEAST_WIDTH):
             times = f"{factor:.3g} times as far as the {what} of the twist says"
             text = f"the pose moves {times} ({unit or 'another scale'})"
-            yield o.finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY)
+            yield o.finding("twist_scale", "warning", factor, SCALE, "times", text, settings=_DENSITY)
         elif left > _UNEXPLAINED and total > 5.0 and width >= _LEAST_WIDTH:
             text = f"the {what} of the twist does not explain {min(left, 1.0):.0%} of the motion of the pose"
             yield o.finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.columns import MOST, Columns, SightingColumns
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se2, se3, so3
@@ -20,6 +20,8 @@ LATER_S = 6.0
 """Most time between both."""
 ASSUMED_RANGE_M, ASSUMED_BEARING_RAD = 0.5, 0.02
 """Standard deviations of ranges and bearings whose noise nobody has stated."""
+HALF = 0.5
+"""Of the residuals: where so little is left with another explanation, that is right."""
 TURNED_RAD, LEAST_TURNED = 0.25, 25
 """The least turn between two sightings that tells a mirror, and how many of these."""
 _TYPICAL_M = 0.05  # what odometry and a detector err within a few seconds, at most, where nothing is wrong
@@ -28,7 +30,7 @@ _DRIVEN_M, _FASTEST = 1.0, 10.0  # _FASTEST: m/m, which no outliers make
 _MOST, _FEWEST = 1.3, 0.1  # m/m, which nearly none exceeds: feet, where beacons are ahead or behind
 _QUARTILE, _WORSE = 0.25, 3.0  # as a run allows for
 _OF_RAYLEIGH = quantile(_QUARTILE, 2) ** 0.5  # the quartile of distances, in sigmas of an axis
-_RAISED, _TINY = 0.5, 1e-3  # part of the sightings whose sigma was raised, and to less than that [m]
+_TINY = 1e-3  # m or rad: sigmas that were raised, and are less
 _TOO_SMALL = 10.0  # of their sigmas, by which two of them differ
 _BEARING_LATER_S, _MIRRORED = 2.0, 0.5  # in which a bearing changes by the turn; rad/rad, half-way from 0 to 1
 
@@ -138,13 +140,13 @@ def check_noise(c: Columns, s: SightingColumns, pairs: Pairs | None = None) -> I
         has_ranges = np.isfinite(s.ranges).any()
         sigma = f"sigma_m={ASSUMED_RANGE_M}" if has_ranges else f"sigma_rad={ASSUMED_BEARING_RAD}"
         settings, share = (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}"), raised / len(s.stamp_ns)
-        yield s.finding("noise_zero", "warning", share, _RAISED, "part", few, raised, settings=settings)
+        yield s.finding("noise_zero", "warning", share, MOST, "part", few, raised, settings=settings)
 
 
 def _raised(c: Columns, s: SightingColumns) -> int:
     """The number of variances of an input that were raised; 0 unless it is most, and they are nearly zero."""
     raised = c.counters[s.input, "covariance_floored"]
-    return raised if raised >= _RAISED * len(s.stamp_ns) and float(np.median(s.sigmas)) <= _TINY else 0
+    return raised if raised >= MOST * len(s.stamp_ns) and float(np.median(s.sigmas)) <= _TINY else 0
 
 
 def _sigmas(s: SightingColumns, pairs: Pairs) -> tuple[str, ...]:
