@@ -1,6 +1,7 @@
 """The innovation: the difference between a measurement and its prediction, normalised by both covariances."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -33,22 +34,8 @@ def innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> list[floa
     for table, rows in graph.by_table(np.array(edges, dtype=np.int64)).items():
         kinds = graph.kind_codes(table.at(rows).vertices)
         for some in [rows] if (kinds == kinds[0]).all() else np.split(rows, len(rows)):
-            out |= _innovations(graph, solver, table, some)
+            out |= zip(table.at(some).ids.tolist(), _least_costs(graph, solver, table, some), strict=True)
     return [out[edge] for edge in edges]
-
-
-def _innovations(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> dict[int, float]:
-    """The same of rows of a table whose vertices are of the same kinds, by edge."""
-    ids = table.at(rows).ids.tolist()
-    try:
-        return dict(zip(ids, _least_costs(graph, solver, table, rows), strict=True))
-    except (np.linalg.LinAlgError, ValueError):  # of one of them
-        if len(rows) == 1:
-            return {ids[0]: np.inf}
-    out = dict[int, float]()
-    for row in np.split(rows, len(rows)):
-        out |= _innovations(graph, solver, table, row)
-    return out
 
 
 def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> list[float]:
@@ -67,10 +54,12 @@ def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) ->
     out = np.full(len(rows), np.inf)
     of = white[is_regular]
     out[is_regular] = np.sum(of * np.linalg.solve(spread[is_regular], of[:, :, None])[:, :, 0], axis=1)
-    for k in np.flatnonzero(is_linear & ~is_regular).tolist():
-        out[k] = white[k] @ np.linalg.lstsq(spread[k], white[k], rcond=None)[0]
-    for k in np.flatnonzero(~is_linear).tolist():
-        out[k] = least_cost(graph, x, graph.edge(int(some.ids[k])), joint[k])
+    for k in np.flatnonzero(~is_regular).tolist():
+        with suppress(np.linalg.LinAlgError, ValueError):
+            if is_linear[k]:
+                out[k] = white[k] @ np.linalg.lstsq(spread[k], white[k], rcond=None)[0]
+            else:
+                out[k] = least_cost(graph, x, graph.edge(int(some.ids[k])), joint[k])
     return np.where(np.isfinite(out), out, np.inf).tolist()
 
 
