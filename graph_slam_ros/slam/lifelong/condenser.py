@@ -12,7 +12,7 @@ from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.levels import ENOUGH, GATE
-from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
+from graph_slam_ros.slam.lifelong.elimination import square_root, symmetric
 from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, added_place, fit_of
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.lifelong.visit import best_known, visit_of
@@ -160,7 +160,7 @@ def composed(space: Geometry, edges: Sequence[Edge]) -> tuple[Numbers, Array]:
     pose, covariance = space.identity, np.zeros((space.dof, space.dof))
     for edge in edges:
         step: Numbers = tuple(edge.measured.tolist())
-        information = edge.weight * product(edge.sqrt_information.T, edge.sqrt_information)
+        information = edge.weight * edge.sqrt_information.T @ edge.sqrt_information
         covariance = space.group.propagate(covariance, step, _inverse(information))
         pose = tuple(map(float, space.group.compose(pose, step)))
     return space.normalized(pose), square_root(symmetric(_inverse(covariance)))
@@ -247,7 +247,7 @@ class Condenser:
         if (by := self.state.scale.change()) != 1.0:
             for one in self._all():
                 place = replace(one.place, information=one.place.information / by)
-                now = added_place(self.space, self.solver.graph, one.base, place, square_root(place.information))
+                now = added_place(self.space, self.solver.graph, one.base, place)
                 self.solver.add([], [now.edge])
                 self.solver.set_weight(one.edge, 0.0)
                 one.place, one.edge = now.place, now.edge
@@ -258,7 +258,7 @@ class Condenser:
         """Begin a place, which has the ends of the visit as well: the odometry to what is around it stays as it is."""
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
-        begun = added_place(self.space, self.solver.graph, base, one, square_root(one.information))
+        begun = added_place(self.space, self.solver.graph, base, one)
         self.state.places.setdefault(cell, []).append(begun)
         gone = [vertex for vertex in visit if vertex != base and vertex not in one.members]
         return Condensed("first", removed=self._replace(gone, base, around.own, [begun.edge]))
@@ -272,7 +272,7 @@ class Condenser:
         self.state.scale.add(fit.as_is, GATE)
         if (result := fit.result) is None:
             return self._composed(visit, after, around, PLACE)
-        now = added_place(self.space, self.solver.graph, at.base, result.place, square_root(result.place.information))
+        now = added_place(self.space, self.solver.graph, at.base, result.place)
         gone = [vertex for vertex in visit if vertex not in one.members]
         cut = [*around.onward, *(around.into if gone[0] == visit[0] else ())]
         removed = self._replace(gone, at.base, [*around.own, *cut, at.edge], [now.edge])

@@ -17,13 +17,7 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.slam.levels import PRIOR_DOF
 from graph_slam_ros.slam.lifelong.constellation import Constellation, combined, turned
-from graph_slam_ros.slam.lifelong.elimination import (
-    marginal_information,
-    product,
-    quadratic,
-    solution,
-    without,
-)
+from graph_slam_ros.slam.lifelong.elimination import marginal_information, solution, square_root, without
 from graph_slam_ros.typing import Array, Numbers
 
 Cell = tuple[int, ...]
@@ -52,6 +46,9 @@ class Place:
     linearized_at: Constellation
     information: Array
     visits: int = 1
+
+    def __deepcopy__(self, memo: object) -> "Place":
+        return self  # nothing in it changes
 
     def shared(self, visit: "Place") -> list[int]:
         """Return the members that a visit saw, too, in their order here."""
@@ -132,11 +129,11 @@ def _sum(space: Geometry, place: Place, visit: Place) -> tuple[Place, float]:
     whole[np.ix_(mine_at, mine_at)] += place.information
     whole[np.ix_(new_at, new_at)] += visit.information
     right_side = np.zeros(before.size)
-    right_side[new_at] = product(visit.information, visit.seen.minus(space, before.part(rows[0])))
+    right_side[new_at] = visit.information @ visit.seen.minus(space, before.part(rows[0]))
     after = before.plus(space, solution(whole, right_side))
-    statistic = quadratic(place.information, after.part(rows[1]).minus(space, place.seen))
-    statistic += quadratic(visit.information, after.part(rows[0]).minus(space, visit.seen))
-    return Place(tuple(members), after, where, whole, place.visits + 1), statistic
+    mine, theirs = after.part(rows[1]).minus(space, place.seen), after.part(rows[0]).minus(space, visit.seen)
+    statistic = mine @ place.information @ mine + theirs @ visit.information @ theirs
+    return Place(tuple(members), after, where, whole, place.visits + 1), float(statistic)
 
 
 def _motion(
@@ -148,8 +145,8 @@ def _motion(
     for _ in range(_STEPS):
         there = mine.moved(space, motion)
         columns = there.rigid_motions(space)
-        along = product(information, columns)
-        step = -solution(product(columns.T, along), product(along.T, there.minus(space, theirs)))
+        along = information @ columns
+        step = -solution(columns.T @ along, along.T @ there.minus(space, theirs))
         added = *step[:d].tolist(), *group.exp((*[0.0] * d, *step[d:].tolist()))[d:]
         motion = space.normalized(tuple(map(float, group.compose(added, motion))))
         if np.abs(step).max() <= _STILL:
@@ -283,20 +280,14 @@ def place_of(edge: Edge, linearized_at: Array, visits: int, strikes: Mapping[int
     """
     base, *members = edge.vertices
     space = PLANAR if PLANAR.pose in edge.type.accepts[0] else SPATIAL
-    information = product(edge.sqrt_information.T, edge.sqrt_information)
+    information = edge.sqrt_information.T @ edge.sqrt_information
     seen, at = (Constellation.from_numbers(space, numbers, len(members)) for numbers in (edge.measured, linearized_at))
     return PlaceEdge(base, Place(tuple(members), seen, at, information, visits), edge.id, dict(strikes or {}))
 
 
-def added_place(space: Geometry, graph: Graph, base: int, place: Place, root: Array) -> PlaceEdge:
-    """Add the edge of a place to a graph.
-
-    Parameters
-    ----------
-    base : the vertex that the place is seen from
-    root : square root of its information
-    """
-    poses = len(place.seen.turns)
+def added_place(space: Geometry, graph: Graph, base: int, place: Place) -> PlaceEdge:
+    """Add the edge of a place to a graph, in which it is seen from the vertex ``base``."""
+    root, poses = square_root(place.information), len(place.seen.turns)
     kind = place_edge(space.pose, len(place.members) - poses, poses)
     edge = graph.edge(graph.add_edge(kind, [base, *place.members], place.seen.numbers, Gaussian(root), LABEL))
     return place_of(edge, place.linearized_at.numbers, place.visits)

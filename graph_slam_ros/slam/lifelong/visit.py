@@ -12,7 +12,7 @@ from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry, rigid_motions
 from graph_slam_ros.slam.levels import SINGULAR
 from graph_slam_ros.slam.lifelong.constellation import Constellation
-from graph_slam_ros.slam.lifelong.elimination import marginal_information, product
+from graph_slam_ros.slam.lifelong.elimination import marginal_information
 from graph_slam_ros.slam.lifelong.place import Place
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array
@@ -140,7 +140,7 @@ def _of_positions(space: Geometry, information: Array, at: Constellation) -> Arr
     order += [first + space.dof * k + axis for k in range(b) for axis in range(d, space.dof)]
     if not b:
         return information
-    return product(product(turn, information), turn.T)[np.ix_(order, order)]
+    return (turn @ information @ turn.T)[np.ix_(order, order)]
 
 
 def _local_solver(
