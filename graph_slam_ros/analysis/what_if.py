@@ -256,17 +256,17 @@ class SavedGraph:
         self.graph, self.solver, self.held = view.graph.copy(), view.solver, view.solver.held
         self.graph.initial.values[:] = view.solver.values
         self.entries = list(ledger_entries(view, range(self.graph.vertex_ids.next)))
-        self._entries, old = {one.edge: one for one in self.entries}, view.bounded.old if view.bounded else ()
+        self._entries, old = {one.edge: one for one in self.entries}, view.bounded.old if view.bounded else {}
         self.changes = list(view.ledger.history)
         self.edits = view.edits
         self.ids, _ = numbered(view)
-        self.keyframes: list[int] = [*(one.vertex for one in old), *view.keyframes.ids.tolist()]
+        self.keyframes: list[int] = [*(one.vertex for one in old.values()), *view.keyframes.ids.tolist()]
         self._names = {mark.vertex: name for name, mark in view.landmarks.items()}
-        self.stamps_ns: list[int] = [*(one.stamp_ns for one in old), *view.keyframes.stamps_ns.tolist()]
+        self.stamps_ns: list[int] = [*(one.stamp_ns for one in old.values()), *view.keyframes.stamps_ns.tolist()]
         self.segments = list(view.segments)
         joined = {vertex for entry in self.entries if entry.is_in for vertex in entry.vertices}
         self.landmarks = {name: mark.vertex for name, mark in view.landmarks.items() if mark.vertex in joined}
-        self.numbers: list[int] = [*(one.number for one in old), *range(view.keyframes.first, len(view.keyframes))]
+        self.numbers: list[int] = [*old, *range(view.keyframes.first, len(view.keyframes))]
         self._numbers = dict(zip(self.keyframes, self.numbers, strict=True))
         self.vertices = dict(zip(self.numbers, self.keyframes, strict=True))
 

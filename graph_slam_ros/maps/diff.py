@@ -241,7 +241,7 @@ def _by_meaning(view: MapView) -> dict[Any, list[int]]:
 def _names(view: MapView) -> dict[int, int | str]:
     """Return the identity of a vertex in any map: a stamp, or a name."""
     poses = dict(zip(view.keyframes.ids.tolist(), view.keyframes.stamps_ns.tolist(), strict=True))
-    poses |= {one.vertex: one.stamp_ns for one in view.bounded.old} if view.bounded else {}
+    poses |= {one.vertex: one.stamp_ns for one in view.bounded.old.values()} if view.bounded else {}
     return poses | {mark.vertex: name for name, mark in view.landmarks.items()}
 
 

@@ -215,7 +215,8 @@ class _Second:
     def _add_verdicts(self, ledger: Ledger, number: Mapping[int, int]) -> None:
         theirs, first, rows = self._two.ledger, self._keyframes, self._two.ledger.ids.existing(list(number))
         verdict = theirs.verdict.values[rows]
-        residuals = np.concatenate([np.empty(0), *map(theirs.residual, number)])
+        is_taken = np.isin(theirs.ids.since(), list(number))
+        residuals = theirs.residuals.values[np.repeat(is_taken, theirs.numbers.values)]
         of_rows = theirs.statistic.values[rows], theirs.numbers.values[rows], theirs.threshold.values[rows]
         ids = ledger.ids.rows(
             ledger.enter(first + theirs.keyframe.values[rows], *of_rows, residuals, verdict != Verdict.NOT_EVALUATED)

@@ -115,6 +115,6 @@ class WholePath:
         path = solver.estimate(view.keyframes.ids).reshape(-1, view.space.pose.size)
         if view.bounded is None:
             return path
-        old = [one.vertex for one in view.bounded.old]
+        old = [one.vertex for one in view.bounded.old.values()]
         vertices = np.sort(np.array([*old, *view.keyframes.ids.tolist()], dtype=np.int64))
         return np.concatenate((self.left.path(view.space, vertices, solver.estimate(vertices)), path))

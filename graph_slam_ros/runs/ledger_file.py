@@ -126,7 +126,7 @@ def ledger_entries(view: MapView, ids: Sequence[int]) -> Iterator[Entry]:
     judged = {change.edge: change.threshold for change in ledger.history}
     last_loss, edges = cache(view.solver.settings.last_loss), ledger.ids.since()
     rows_of = {table.code: _rows(view, table, np.asarray(ids, dtype=np.int64)) for table in graph.tables.values()}
-    residuals, ends = ledger.residuals.tolist(), np.cumsum(ledger.numbers.values).tolist()
+    residuals, ends = ledger.residuals.values.tolist(), np.cumsum(ledger.numbers.values).tolist()
     chi2, _ = view.solver.chi2_of(edges)
     columns = (ledger.keyframe, ledger.statistic, ledger.numbers, ledger.threshold, ledger.verdict, ledger.reason)
     of_graph = (edges, *graph.places(edges), chi2)
@@ -162,7 +162,7 @@ def _rows(view: MapView, table: EdgeTable, ids: Index) -> tuple[str, list[Any]]:
     """The tag of a table, and what an entry has of each row: all rows at once, as one by one is slow."""
     stamp_of, names = np.zeros(view.graph.vertex_ids.next, dtype=np.int64), [""] * view.graph.vertex_ids.next
     stamp_of[view.keyframes.ids] = view.keyframes.stamps_ns
-    for one in view.bounded.old if view.bounded else ():
+    for one in view.bounded.old.values() if view.bounded else ():
         stamp_of[one.vertex] = one.stamp_ns
     for name, mark in view.landmarks.items():
         names[mark.vertex] = name

@@ -38,7 +38,7 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
 from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
-from graph_slam_ros.slam.lifelong.state import BoundedState, OldKeyframe
+from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise.factors import factors_record, read_factors
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -173,7 +173,7 @@ def _condensed(graph: Graph, state: BoundedState) -> Told:
             places.append([cell, edge(one.edge), one.place.visits, strikes, at])
     return {
         "places": places,
-        "old": [(one.number, vertex(one.vertex), one.stamp_ns, one.T_odom_base) for one in state.old],
+        "old": [(number, vertex(one.vertex), one.stamp_ns, one.T_odom_base) for number, one in state.old.items()],
         "left": [state.keyframes, state.sightings],
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
@@ -202,7 +202,7 @@ def _columns(state: MapSnapshot) -> Iterator[tuple[str, NDArray[Any]]]:
     for edge, table in graph.tables.items():
         yield from ((f"{tag_of(edge)}/{name}", getattr(table, _ROWS.get(name, name)).values) for name in _OF_EDGES)
     yield from ((f"ledger/{name}", getattr(ledger, name).values) for name in _OF_VERDICTS)
-    yield "ledger/residual", ledger.residuals
+    yield "ledger/residual", ledger.residuals.values
     for name in _OF_CHANGES:
         kind = np.float64 if name in ("statistic", "threshold") else np.int64
         numbers: NDArray[Any] = np.array([getattr(one, name) for one in ledger.history], dtype=kind)
@@ -311,5 +311,5 @@ def _bounded(graph: Graph, told: Told) -> BoundedState:
         edge, where = graph.edge(graph.edge_ids.of(number)), np.array(at, dtype=np.float64)
         place = place_of(edge, where, visits, {of(mark): count for mark, count in strikes})
         state.places.setdefault(tuple(cell), []).append(place)
-    state.old += [OldKeyframe(number, of(vertex), stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]]
+    state.old |= {number: Keyframe(of(vertex), stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]}
     return state

@@ -237,9 +237,8 @@ def numbered(view: MapView) -> tuple[list[int], str]:
     A vertex that is not part of the map any more is ``unused``: a deleted landmark.
     """
     names: list[tuple[int, int, str, int | str, str]] = []
-    for one in view.bounded.old if view.bounded else ():
-        names.append((one.number, one.vertex, "keyframe", one.stamp_ns, str(one.number)))
-    for k, keyframe in enumerate(view.keyframes, start=view.keyframes.first):
+    old = view.bounded.old.items() if view.bounded else ()
+    for k, keyframe in (*old, *enumerate(view.keyframes, start=view.keyframes.first)):
         names.append((k, keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
     for k, (name, landmark) in enumerate(view.landmarks.items(), start=len(view.keyframes)):
         names.append((k, landmark.vertex, "landmark", "", name))

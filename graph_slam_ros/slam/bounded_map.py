@@ -8,6 +8,7 @@ does.
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.levels import ENOUGH
 from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, seen_from
 from graph_slam_ros.slam.lifelong.place import Cell
-from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
+from graph_slam_ros.slam.lifelong.state import Left, Records, record_type
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Reason, Verdict
 from graph_slam_ros.slam.solution import Solution
@@ -134,12 +135,12 @@ class BoundedMap:
             self._tried = len(keyframes) + _AGAIN
             return None
         self._landmarks.map.withdraw_tentative(self._limit)
-        before = self.state.copy()
+        places, scale = deepcopy((self.state.places, self.state.scale))
         self._tried = len(keyframes)
         condensed = backend.all_or_nothing(_SOURCE, self._condensed_visits)
         if condensed is None:
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
-            self.state.places, self.state.scale = before.places, before.scale
+            self.state.places, self.state.scale = places, scale
             return None
         rows, end = condensed
         return self._compacted(rows, Left(self._left(rows), self._sightings(end)), end) if rows else None
@@ -209,8 +210,7 @@ class BoundedMap:
         keyframes = self._frontend.path.keyframes
         for k, row in enumerate(rows):
             if row.base == row.vertex:
-                one = keyframes[keyframes.first + k]
-                self.state.old.append(OldKeyframe(keyframes.first + k, row.vertex, one.stamp_ns, one.T_odom_base))
+                self.state.old[keyframes.first + k] = keyframes[keyframes.first + k]
         before = self.state.sightings
         vertices, edges = self._staying(int(keyframes.ids[end - keyframes.first]))
         gone = np.setdiff1d(self._backend.graph.edge_ids.since(), edges)

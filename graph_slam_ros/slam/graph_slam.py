@@ -91,7 +91,7 @@ class GraphSlam:
         self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
-        self.view = MapView(backend, frontend, landmarks, doubt, solution, trials, found, self.settings)
+        self.view = MapView(backend, frontend, landmarks, doubt, solution, self.settings)
         if start.keyframes:
             self._restore(start)
         self._bounded = BoundedMap(backend, frontend, landmarks, self._anchor, doubt, solution, counters)
@@ -194,7 +194,8 @@ class GraphSlam:
             case Fix():
                 self._add_fix(admitted, self._frontend.where(admitted))
             case Closure():
-                self._frontend.add_closure(admitted, self._frontend.where(admitted))
+                later, earlier = self._frontend.where(admitted), self._frontend.path.where(admitted.from_stamp_ns)
+                self._frontend.edges.closure(admitted, earlier, later)
         self._solve_if_due()
 
     def _add_sightings(self, m: Sightings, where: PoseAtStamp) -> None:

@@ -1,6 +1,7 @@
 """What can be read of a pipeline: path, landmarks, covariances, statistics and health."""
 
 from collections.abc import Sequence, Set
+from copy import deepcopy
 from dataclasses import asdict
 from typing import Any
 
@@ -18,7 +19,6 @@ from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.doubt.record import Doubt
-from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
@@ -29,7 +29,6 @@ from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Correction, Solution
-from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -53,13 +52,11 @@ class MapView:
         landmarks: LandmarkFrontend,
         doubt: OdometryDoubt,
         solution: Solution,
-        trials: TrialFits,
-        found_factors: FoundFactors,
         settings: dict[str, Value],
     ) -> None:
         self.backend, self._frontend, self._landmarks = backend, frontend, landmarks
         self._doubt, self._solution, self._settings = doubt, solution, settings
-        self.trials, self._found_factors, self.corrections = trials, found_factors, frontend.corrections
+        self.trials, self.corrections = solution.trials, frontend.corrections
 
     def __repr__(self) -> str:
         counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
@@ -95,7 +92,7 @@ class MapView:
     @property
     def began_ns(self) -> int:
         """The stamp of the first keyframe of all."""
-        return self.bounded.old[0].stamp_ns if self.bounded else self.keyframes[0].stamp_ns
+        return next(iter(self.bounded.old.values())).stamp_ns if self.bounded else self.keyframes[0].stamp_ns
 
     @property
     def bounded(self) -> BoundedState | None:
@@ -123,7 +120,7 @@ class MapView:
 
     def shown_path(self) -> tuple[Index, Array]:
         """Stamps and estimated poses of all keyframes that are in the graph, in order of time."""
-        old = self.bounded.old if self.bounded else []
+        old = self.bounded.old.values() if self.bounded else ()
         vertices = [*(one.vertex for one in old), *self.keyframes.ids.tolist()]
         stamps_ns = [*(one.stamp_ns for one in old), *self.keyframes.stamps_ns.tolist()]
         poses = self.solver.estimate(vertices).reshape(-1, self.space.pose.size)
@@ -263,7 +260,7 @@ class MapView:
     @property
     def corrected(self) -> Sequence[Fitted]:
         """The findings of these factors, in order."""
-        return self._found_factors.corrected
+        return self._solution.found_factors.corrected
 
     @property
     def landmark_changes(self) -> int:
@@ -339,7 +336,7 @@ class MapView:
 
     def snapshot(self, folder: Any = None) -> MapSnapshot:
         """A copy of the map as it is now. What was condensed is in the run folder that is given."""
-        ledger, bounded = self.ledger.copy(), self.bounded
+        ledger = self.ledger.copy()
         ledger.history = list(self.ledger.history)
         ledger.finish(self.backend.frozen_edges)
         return MapSnapshot(
@@ -362,7 +359,7 @@ class MapView:
             edits=list(self.edits),
             calibration=self.corrections.totals(),
             gyro_bias=self._frontend.gyro.saved if self._frontend.gyro else None,
-            bounded=bounded.copy() if bounded else None,
+            bounded=deepcopy(self.bounded),
             folder=folder,
         )
 

@@ -74,7 +74,7 @@ class MapSnapshot:
     def vertices(self) -> list[int]:
         """The vertices of the problem. The others belonged to removed landmarks."""
         poses = set(self.keyframes.ids.tolist())
-        poses |= {one.vertex for one in self.bounded.old} if self.bounded else set()
+        poses |= {one.vertex for one in self.bounded.old.values()} if self.bounded else set()
         points = {mark.vertex for mark in self.landmarks.values()}
         return sorted(poses | points)
 

@@ -61,6 +61,7 @@ class Solution:
     Attributes
     ----------
     guard : keeps the estimate a good one where a solve fails
+    trials : say what is off; found_factors : factors of odometry that the association found
     solves : that succeeded
     report : of the last solve of everything
     correction : of the last solve
@@ -80,7 +81,7 @@ class Solution:
     ) -> None:
         self._space, self._backend, self._frontend = frontend.config.space, backend, frontend
         self._landmarks, self._doubt = landmarks, doubt
-        self._trials, self._found_factors = trials, found_factors
+        self.trials, self.found_factors = trials, found_factors
         self.guard = FailureGuard(backend, counters, landmarks.map)
         self.solves = 0
         self.report: Report | None = None
@@ -166,9 +167,9 @@ class Solution:
             report = backend.optimize(everything)
         if not backend.holds_back:
             report = backend.scale_noise(everything) or report
-        self._trials.after_solve(is_of_everything=everything is not None)
+        self.trials.after_solve(is_of_everything=everything is not None)
         if not backend.holds_back:
-            report = self._found_factors.after_solve(everything) or report
+            report = self.found_factors.after_solve(everything) or report
         return report
 
     def _covariance(self) -> Array:

@@ -252,10 +252,6 @@ class KeyframeFrontend:
             self.edges.initial_pose(keyframes[-1].vertex, given)
         return given is not None
 
-    def add_closure(self, m: Closure, where: PoseAtStamp) -> None:
-        """Add a loop closure from an earlier pose to the pose at its stamp."""
-        self.edges.closure(m, self.path.where(m.from_stamp_ns), where)
-
     def follow_frozen(self, m: Sightings) -> None:
         """Add a keyframe between loose edges where sightings show that the robot moved and odometry stood still."""
         where, motion = self.path.where(m.stamp_ns), self.path.motion

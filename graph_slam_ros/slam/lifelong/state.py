@@ -5,15 +5,16 @@ Each of these is stored relative to its base, a vertex that stays, and moves wit
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.lifelong.place import Cell, PlaceEdge, VisitScale
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Index
 
 Records = NDArray[np.void]
 """Rows of ``record_type``."""
@@ -30,21 +31,6 @@ def record_type(space: Geometry) -> np.dtype[np.void]:
     return np.dtype([("stamp_ns", "<i8"), ("of", "<i8"), ("base", "<i8"), *poses])
 
 
-@dataclass(frozen=True, slots=True)
-class OldKeyframe:
-    """A keyframe that is in the graph, and in no list of keyframes any more: the base of a place, or one that was kept.
-
-    Attributes
-    ----------
-    number : of the keyframe; vertex : its id in the graph
-    """
-
-    number: int
-    vertex: int
-    stamp_ns: int
-    T_odom_base: Numbers
-
-
 @dataclass(slots=True)
 class BoundedState:
     """The state of a condensed map that is not in its graph.
@@ -53,7 +39,8 @@ class BoundedState:
     ----------
     places : by cell
     scale : of the variances of visits
-    old : the keyframes in the graph that are in no list of keyframes any more, in order of time
+    old : by number, the keyframes in the graph that are in no list of keyframes any more, in order of time: bases of
+        places, and those that were kept
     keyframes, sightings : how many have left the map
     accepted : of each drive, by its first keyframe, how many accepted measurements of each input have left the map
     begins : of each drive, by its first keyframe, if that has left: how many poses of sightings are before it
@@ -61,21 +48,11 @@ class BoundedState:
 
     places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
     scale: VisitScale = field(default_factory=VisitScale)
-    old: list[OldKeyframe] = field(default_factory=list)
+    old: dict[int, Keyframe] = field(default_factory=dict)
     keyframes: int = 0
     sightings: int = 0
     accepted: dict[int, Counter[str]] = field(default_factory=dict)
     begins: dict[int, int] = field(default_factory=dict)
-
-    def copy(self) -> "BoundedState":
-        """Return another one, which changes by itself."""
-        places = {
-            cell: [PlaceEdge(one.base, one.place, one.edge, dict(one.strikes)) for one in several]
-            for cell, several in self.places.items()
-        }
-        accepted = {first: Counter(of) for first, of in self.accepted.items()}
-        old, begins = list(self.old), dict(self.begins)
-        return replace(self, places=places, scale=replace(self.scale), old=old, accepted=accepted, begins=begins)
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,6 +69,7 @@ class Ledger:
     verdict, reason : codes of ``Verdict`` and ``Reason``
     statistic, threshold : chi2 that was last judged, and what it was held against
     numbers : how many numbers were measured, the statistic's degrees of freedom
+    residuals : end to end, how far each of these was from what was expected when the edge came, in its units
     keyframe : at which it was judged first
     changes : how often a verdict was set after an edge was entered
     final : verdicts of edges below this id stay: they are of a map that is frozen
@@ -80,7 +81,7 @@ class Ledger:
         self.ids = LastingIds("edge", self.verdict)
         self.statistic, self.threshold = Column(np.float64), Column(np.float64)
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
-        self._residual, self._residual_at = Column(np.float64), Column(np.int64)
+        self.residuals = Column(np.float64)
         self.history: list[VerdictChange] = []
         self.final = self.changes = 0
         self._out: set[int] = set()
@@ -98,16 +99,11 @@ class Ledger:
 
     def keep(self, edges: Index) -> None:
         """Forget all edges but some, and the history of the others."""
-        rows = self.ids.rows(edges)
-        numbers = self.numbers.values[rows]
-        begins = np.cumsum(numbers) - numbers
-        at = np.repeat(self._residual_at.values[rows] - begins, numbers) + np.arange(int(numbers.sum()))
+        is_kept = np.isin(self.ids.since(), edges)
         self.ids.put(edges, self.ids.next)
-        self._residual.values = self._residual.values[at]
-        for name in ("verdict", "reason", "statistic", "threshold", "numbers", "keyframe"):
-            column = getattr(self, name)
-            column.values = column.values[rows]
-        self._residual_at.values = begins
+        self.residuals.values = self.residuals.values[np.repeat(is_kept, self.numbers.values)]
+        for column in (self.verdict, self.reason, self.statistic, self.threshold, self.numbers, self.keyframe):
+            column.values = column.values[is_kept]
         self.history[:] = [one for one in self.history if self.ids.has(one.edge)]
         self._out = set(filter(self.ids.has, self._out))
 
@@ -145,8 +141,7 @@ class Ledger:
             (self.statistic, statistic, count),
             (self.threshold, threshold, count),
             (self.numbers, numbers, count),
-            (self._residual_at, len(self._residual) + np.cumsum(numbers) - numbers, count),
-            (self._residual, residuals, len(residuals)),
+            (self.residuals, residuals, len(residuals)),
         )
         return ids
 
@@ -175,18 +170,6 @@ class Ledger:
         self.statistic.values[row] = statistic
         limit = float(self.threshold.values[row]) if threshold is None else threshold
         self.history.append(VerdictChange(edge, keyframe, verdict, reason, float(statistic), limit))
-
-    @property
-    def residuals(self) -> Array:
-        """The residuals of all edges, end to end: as many numbers of each as it measured."""
-        return self._residual.values
-
-    def residual(self, edge: int) -> Array:
-        """Return the difference between the measurement and its prediction when it came, in its units."""
-        row = self.ids.row(edge)
-        first = int(self._residual_at.values[row])
-        out: Array = self._residual.values[first : first + int(self.numbers.values[row])]
-        return out
 
     def verdict_of(self, edge: int) -> Verdict:
         """The verdict on one edge; new edges without a record have one, too."""
