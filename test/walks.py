@@ -33,7 +33,7 @@ WITHIN = {  # calls on the way that belong to another walk; without a name, to n
         "runs/recorder.py:record": "solve",
         "runs/recorder.py:flush": "solve",
         "node/session.py:_estimated": "solve",
-        "node/runtime.py:_on_update": "solve",
+        "node/publishers.py:on_update": "solve",
         "slam/map_view.py:snapshot": "",
         "node/publishers.py:publish_due": "",
     },

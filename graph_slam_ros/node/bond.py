@@ -35,17 +35,7 @@ def is_installed() -> bool:
 
 
 class Bond:
-    """One end of a bond. It lasts until ``end``.
-
-    Parameters
-    ----------
-    node : the ``GraphSlamNode``
-
-    Raises
-    ------
-    ConfigError
-        The messages are not installed.
-    """
+    """One end of a bond. It lasts until ``end``."""
 
     def __init__(self, node: "GraphSlamNode") -> None:
         self._node, self._instance = node, str(uuid4())
@@ -54,33 +44,30 @@ class Bond:
         self._publisher = node.create_publisher(self._status, "bond", 5)
         self._subscription = node.create_subscription(self._status, "bond", node.guarded(self._on_status), 100)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(_PERIOD_S, node.guarded(self._beat), clock=steady)
+        self._timer = node.create_timer(_PERIOD_S, node.guarded(self._publish), clock=steady)
 
     def end(self) -> None:
         """Tell the manager that the node ends, so that it does not have to notice the silence."""
         self._node.destroy_timer(self._timer)
-        if not self._is_over:
-            self._publish(is_active=False)
-            self._publisher.wait_for_all_acked(_ACKNOWLEDGED)
+        self._publish(is_active=False)
+        self._publisher.wait_for_all_acked(_ACKNOWLEDGED)
         self._node.destroy_subscription(self._subscription)
         self._node.destroy_publisher(self._publisher)
-
-    def _beat(self) -> None:
-        if not self._is_over:
-            self._publish(is_active=True)
 
     def _on_status(self, status: Any) -> None:
         if status.id != self._node.get_name() or status.instance_id == self._instance or self._is_over:
             return
         if not status.active:
-            self._is_over = True
             self._publish(is_active=False)  # what the manager waits for
+            self._is_over = True
             self._node.get_logger().warn("the lifecycle manager has ended the bond")
         elif not self._is_formed:
             self._is_formed = True
             self._node.get_logger().info("bond with the lifecycle manager")
 
-    def _publish(self, *, is_active: bool) -> None:
+    def _publish(self, *, is_active: bool = True) -> None:
+        if self._is_over:
+            return
         status = self._status(
             id=self._node.get_name(),
             instance_id=self._instance,

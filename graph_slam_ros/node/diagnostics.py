@@ -17,7 +17,6 @@ from graph_slam_ros.findings.table import DOUBTS, explain
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
-from graph_slam_ros.node.events import Outcome
 from graph_slam_ros.runs.outcome import MOTION
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
@@ -39,18 +38,11 @@ _SHARE, _LEAST = 0.1, 3  # of what came, and how much at least
 
 @dataclass(frozen=True, slots=True)
 class Recent:
-    """The counts of one input in the last ten seconds; of a message that holds several things, each counts.
-
-    Attributes
-    ----------
-    came : things
-    refused : how many of them by reason, by the border and by the pipeline; what was repaired is not refused
-    goes_on : whether something was refused in the last three seconds, or nothing came then
-    """
+    """The counts of one input in the last ten seconds; of a message that holds several things, each counts."""
 
     came: int = 0
-    refused: Mapping[str, int] = field(default_factory=dict)
-    goes_on: bool = False
+    refused: Mapping[str, int] = field(default_factory=dict)  # by reason, by the border and by the pipeline
+    goes_on: bool = False  # something was refused in the last three seconds, or nothing came then
 
     @property
     def times(self) -> int:
@@ -75,38 +67,23 @@ class Recent:
 
 @dataclass(frozen=True, slots=True)
 class InputFacts:
-    """The facts of one input.
-
-    Attributes
-    ----------
-    received, used : messages, and what of them the estimate has used: of a message that holds several things, each
-    counts : since the start, of what was refused, repaired or noted, by reason
-    silent_s : since the last message, by the clock of the node; infinite before the first
-    publishers : names of the nodes that publish it
-    is_contested : whether several publish what is of one: an odometry
-    mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
-    frames : those of its messages that nothing links to the robot, the last ones, each with the robot's
-    recent : what became of it in the last seconds
-    not_found : of odometry on /tf, the transform that has never come, and what mends that
-    late_s : the least time from a stamp to its arrival, of the last messages; NaN where none came, or no clock runs
-    alternatives : where nobody publishes it, other topics that it could use, each with the parameter that chooses it
-    """
+    """The facts of one input."""
 
     name: str
     topic: str
     use: str
-    received: int = 0
-    used: int = 0
-    counts: Mapping[str, int] = field(default_factory=dict)
-    silent_s: float = math.inf
-    publishers: tuple[str, ...] = ()
-    is_contested: bool = False
-    mismatch: str = ""
-    frames: tuple[tuple[str, str], ...] = ()
+    received: int = 0  # messages
+    used: int = 0  # of what they hold, what the estimate has used
+    counts: Mapping[str, int] = field(default_factory=dict)  # since the start, by reason
+    silent_s: float = math.inf  # since the last message, by the clock of the node
+    publishers: tuple[str, ...] = ()  # names of their nodes
+    is_contested: bool = False  # several publish what is of one: an odometry
+    mismatch: str = ""  # what keeps publisher and subscription from connecting, in words
+    frames: tuple[tuple[str, str], ...] = ()  # the last that nothing links to the robot, each with the robot's
     recent: Recent = field(default_factory=Recent)
-    not_found: str = ""
-    alternatives: tuple[str, ...] = ()
-    late_s: float = math.nan
+    not_found: str = ""  # of odometry on /tf, the transform that has never come, and what mends that
+    alternatives: tuple[str, ...] = ()  # where nobody publishes it, other topics, with the parameters that choose them
+    late_s: float = math.inf  # the least time from a stamp to its arrival, of the last messages
 
     @property
     def unpublished(self) -> Finding | None:
@@ -117,31 +94,19 @@ class InputFacts:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the state of the node is judged from.
+    """What the state of the node is judged from."""
 
-    Attributes
-    ----------
-    lifecycle : the state of the lifecycle; the others count while it is active
-    weakest : the weakest directions of the newest pose and of the landmarks, in words
-    of_node : what its parts found: errors, what it waits for (notes), and what makes the estimate worse
-    of_inputs : what the check of the inputs found; while nothing is corrected they may be wrong from the beginning
-    outcome : of the last ~/remove or initialpose that was asked for
-    path_version : messages of ~/path_updates since it began anew
-    lag_s, waiting : since the present job was queued, and queued jobs
-    faults : exceptions of callbacks in the last ten seconds
-    """
-
-    lifecycle: str
+    lifecycle: str  # its state; all else counts while it is active
     inputs: tuple[InputFacts, ...] = ()
     estimate: Estimate | None = None
-    weakest: Mapping[str, str] = field(default_factory=dict)
-    of_node: tuple[Finding, ...] = ()
-    of_inputs: tuple[Finding, ...] = ()
-    outcome: Outcome | None = None
+    weakest: Mapping[str, str] = field(default_factory=dict)  # directions of the newest pose and of landmarks, in words
+    of_node: tuple[Finding, ...] = ()  # errors, what it waits for (notes), and what makes the estimate worse
+    of_inputs: tuple[Finding, ...] = ()  # of the check of what they measure
+    outcome: Status | None = None  # of the last ~/remove or initialpose
     path_version: int = 0
     lag_s: float = 0.0
-    waiting: int = 0
-    faults: int = 0
+    waiting: int = 0  # messages
+    faults: int = 0  # exceptions of callbacks in the last ten seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +120,11 @@ class Health:
     def reasons(self) -> tuple[str, ...]:
         """One sentence of each finding, without the option of the commands, which a node does not have."""
         return tuple(str(one).replace("--set ", "") for one in self.found)
+
+    @property
+    def text(self) -> str:
+        """The state and the reasons in one line."""
+        return "; ".join((self.state, *self.reasons))
 
     @property
     def level(self) -> int:
@@ -279,50 +249,50 @@ def _uncorrected(facts: Facts) -> Iterator[Finding]:
 
 def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
     """Yield the statuses of /diagnostics: the verdict, each input, and the graph."""
-    message = "; ".join((verdict.state, *verdict.reasons))
-    healthy = {"healthy": str(verdict.state == "OK"), "state": verdict.state}
-    reasons = {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}
-    load = {"lag [s]": f"{facts.lag_s:.3f}", "messages waiting": str(facts.waiting)}
-    load |= {"faults in 10 s": str(facts.faults)}
-    yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
+    status = partial(Status, hardware_id=node)
+    values = {"healthy": str(verdict.state == "OK"), "state": verdict.state}
+    values |= {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}
+    values |= {"lag [s]": f"{facts.lag_s:.3f}", "messages waiting": str(facts.waiting)}
+    values |= {"faults in 10 s": str(facts.faults)}
+    yield status(verdict.level, f"{node}: health", verdict.text, values=values)
     for one in facts.inputs:
-        values = {"topic": one.topic, "use": one.use}
-        values |= {INPUT_COLUMNS["received"]: str(one.received), INPUT_COLUMNS["used"]: str(one.used)}
-        values |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
-        values |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
-        values |= {"late [s]": f"{one.late_s:.2f}"} if math.isfinite(one.late_s) else {}
-        values |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
-        is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
-        is_absent = not one.received and (one.use == "odometry" or not one.publishers)
-        level = WARN if is_wrong or is_absent else OK
-        nobody = str(one.unpublished) if is_absent and one.unpublished else ""
-        message = one.mismatch or nobody or f"{one.received} {INPUT_COLUMNS['received']}"
-        yield Status(level, f"{node}: input {one.name}", message, node, values)
+        yield _input_status(one, node)
     if facts.outcome is not None:
-        yield Status(OK if facts.outcome.is_done else WARN, f"{node}: asked", facts.outcome.text, node, {})
-    if facts.estimate:
-        values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
-        yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)
-        if calibration := facts.estimate.calibration:
-            found = [name for name in calibration if name.startswith("corrected ")] or ["nothing corrected"]
-            found += [f"{OFF}: {calibration[OFF]}"] if OFF in calibration else []
-            yield Status(OK, f"{node}: calibration", "; ".join(found), node, dict(calibration))
-        if gyro := facts.estimate.gyro:
-            yield Status(OK, f"{node}: gyro", gyro, node, {"gyro": gyro})
-        condensed = f"; condensed: {facts.estimate.condensed}" if facts.estimate.condensed else ""
-        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes{condensed}", node, values)
+        yield status(facts.outcome.level, f"{node}: asked", facts.outcome.message)
+    if (e := facts.estimate) is None:
+        return
+    yield status(OK, f"{node}: weak directions", _weakness(facts, e), values=facts.weakest)
+    if e.calibration:
+        found = [name for name in e.calibration if name.startswith("corrected ")] or ["nothing corrected"]
+        found += [f"{OFF}: {e.calibration[OFF]}"] if OFF in e.calibration else []
+        yield status(OK, f"{node}: calibration", "; ".join(found), values=dict(e.calibration))
+    if e.gyro:
+        yield status(OK, f"{node}: gyro", e.gyro, values={"gyro": e.gyro})
+    condensed = f"; condensed: {e.condensed}" if e.condensed else ""
+    values = _graph(e) | {"path updates sent": str(facts.path_version)}
+    yield status(OK, f"{node}: graph", f"{e.keyframes} keyframes{condensed}", values=values)
+
+
+def _input_status(one: InputFacts, node: str) -> Status:
+    values = {"topic": one.topic, "use": one.use}
+    values |= {INPUT_COLUMNS["received"]: str(one.received), INPUT_COLUMNS["used"]: str(one.used)}
+    values |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
+    values |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
+    values |= {"late [s]": f"{one.late_s:.2f}"} if math.isfinite(one.late_s) else {}
+    values |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
+    is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
+    is_absent = not one.received and (one.use == "odometry" or not one.publishers)
+    nobody = str(one.unpublished) if is_absent and one.unpublished else ""
+    message = one.mismatch or nobody or f"{one.received} {INPUT_COLUMNS['received']}"
+    return Status(WARN if is_wrong or is_absent else OK, f"{node}: input {one.name}", message, node, values)
 
 
 def _weakness(facts: Facts, estimate: Estimate) -> str:
-    """The weakest directions, and for how long and why the pose is weak, if no landmark is seen for long."""
-    weakest, unseen_m = ", ".join(facts.weakest.values()), estimate.unseen.length_m
-    uses_landmarks = any(one.use == "landmarks" for one in facts.inputs)
-    unseen = (
-        f"position and heading weak for {unseen_m:.0f} m: no landmark seen"
-        if uses_landmarks and unseen_m >= _UNSEEN_M
-        else ""
-    )
-    return "; ".join(filter(None, (weakest, unseen)))
+    """The weakest directions, and for how long the pose is weak, if no landmark is seen for long."""
+    text, unseen_m = ", ".join(facts.weakest.values()), estimate.unseen.length_m
+    if unseen_m >= _UNSEEN_M and any(one.use == "landmarks" for one in facts.inputs):
+        text = f"{text}; position and heading weak for {unseen_m:.0f} m: no landmark seen"
+    return text
 
 
 def _graph(e: Estimate) -> dict[str, str]:

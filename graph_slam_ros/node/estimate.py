@@ -31,21 +31,13 @@ _FEWEST_JUDGED = 20  # edges of an input: of fewer nothing is said
 
 @dataclass(frozen=True, slots=True)
 class UnseenWay:
-    """The distance driven since a landmark was last seen.
+    """The distance driven since a landmark was last seen."""
 
-    Attributes
-    ----------
-    keyframes, changes : keyframes, and changes of landmarks, that are counted already
-    length_m : by odometry, from keyframe to keyframe
-    since_ns : stamp of the keyframe at which it began; 0 before the first
-    direction : of the last keyframe from the one before, in odometry's frame
-    """
-
-    keyframes: int
-    changes: int
-    length_m: float = 0.0
-    since_ns: int = 0
-    direction: Numbers = ()
+    keyframes: int  # that are counted already
+    changes: int  # of landmarks, that are
+    length_m: float = 0.0  # by odometry, from keyframe to keyframe
+    since_ns: int = 0  # stamp of the keyframe at which it began; 0 before the first
+    direction: Numbers = ()  # of the last keyframe from the one before, in odometry's frame
 
     def goes_on(self, view: MapView) -> "UnseenWay":
         """Return the distance after an update."""
@@ -76,7 +68,7 @@ class WeakestLandmark:
         self._found = {name: one for name, one in self._found.items() if name in view.landmarks}
         turn = [names[(self._next + k) % len(names)] for k in range(min(_IN_TURN, len(names)))]
         self._next = (self._next + len(turn)) % len(names)
-        chosen = list(dict.fromkeys([*filter(None, [self._name]), *turn]))
+        chosen = list(dict.fromkeys([*([self._name] if self._found else []), *turn]))
         for name, covariance in zip(chosen, view.landmark_covariances(chosen), strict=True):
             if np.isfinite(covariance).all():
                 value = tuple(view.solver.estimate([view.landmarks[name].vertex])[0].tolist())
@@ -96,20 +88,14 @@ class Estimate:
 
     Attributes
     ----------
-    T_map_odom : the correction; of identity before the first keyframe
     T_odom_keyframe, covariance, stamp_ns : odometry's pose, tangent covariance and stamp of the newest keyframe
-    source : the odometry in use
     is_confirmed : whether the robot knows where it is in a map that was loaded
-    unseen : the way since a landmark was seen
-    weakest_landmark : the landmark that is known least, with its weakest direction; empty where none is known
+    is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
+    is_lost : whether that is so since odometry jumped
     fit : chi2 per degree of freedom; NaN before it was looked at
     doubted : inputs of which most measurements are not believed lately, and ids that are all new from some time on
     findings : what else is wrong with the map and its motion
-    condensed : which keyframes were condensed, or why none was in a long drive; empty in a short one
-    gyro : its state and its bias; empty where no input is one
-    calibration : settings of odometry's factors that the association found, and what is off without being corrected
-    is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
-    is_lost : whether that is so since odometry jumped
+    weakest_landmark, condensed, gyro, calibration : in words; empty where there is nothing to say
     """
 
     T_map_odom: Numbers
@@ -171,7 +157,8 @@ def estimate_of(slam: GraphSlam, **known: Any) -> Estimate:
         findings=tuple(_found(slam)),
         condensed=condensed_text(condensed_part(view)),
         gyro=str(view.gyro or ""),
-        calibration=_calibration(view.corrections.lines(), view.trials.contradicted()),
+        calibration={f"corrected {name}": str(value) for name, value in view.corrections.lines().items()}
+        | ({OFF: ", ".join(off)} if (off := view.trials.contradicted()) else {}),
         **known,
     )
 
@@ -204,18 +191,8 @@ def doubted_lately(view: MapView) -> tuple[Finding, ...]:
     return (*(one for one in found if one.severity == "error"), *of_map({"renewed_ids": view.renewed_ids()}))
 
 
-def _calibration(found: Mapping[str, float], contradicted: Sequence[str]) -> dict[str, str]:
-    settings = {f"corrected {name}": str(value) for name, value in found.items()}
-    return settings | ({OFF: ", ".join(contradicted)} if contradicted else {})
-
-
 class Resumption:
-    """Compares the odometry before a restart with the first after it.
-
-    Parameters
-    ----------
-    T_map_odom, odometry : the last correction before, and the last odometry
-    """
+    """Compares the odometry before a restart with the first after it: the last correction counts if it goes on."""
 
     def __init__(self, config: Config, T_map_odom: Numbers, odometry: Sequence[Odometry]) -> None:
         self.T_map_odom = T_map_odom
@@ -249,7 +226,8 @@ class Resumption:
     def _is_continuous(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> bool:
         last, n = self._last[-1], self._space.dimensions
         since_s = (stamp_ns - last.stamp_ns) * 1e-9
-        if _name(source) != _name(last.source) or not 0.0 < since_s <= _LONGEST_S:
+        is_same = source.partition("#")[0] == last.source.partition("#")[0]  # publishers are numbered anew
+        if not is_same or not 0.0 < since_s <= _LONGEST_S:
             return False
         moved = self._space.group.between(last.T_odom_base, T_odom_base)
         far_m = math.hypot(*moved[:n])
@@ -270,8 +248,3 @@ _LEAST_S, _LONGEST_S = 1e-3, 60.0  # without odometry: after more, the robot may
 _TAIL_BYTES = 2**16  # some seconds of a robot's journal
 _LEAST, _MOST = 0.3, 1.2  # times the way at the speed before: so far it has driven since
 _NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm
-
-
-def _name(source: str) -> str:
-    """The name of the input. Its publishers are numbered anew after a restart."""
-    return source.partition("#")[0]

@@ -1,7 +1,6 @@
 """Messages of ``~/events``: one status for each event, with its numbers as values."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from graph_slam_ros.messages.to_msg import OK, WARN, Status
 from graph_slam_ros.slam import MapView, Update
@@ -9,14 +8,6 @@ from graph_slam_ros.slam.doubt.record import ELSEWHERE, Doubt
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
 
 _EDGES = 1000  # of one update that are moved one by one
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The outcome of something that was asked for on a topic."""
-
-    text: str
-    is_done: bool
 
 
 def happened(what: str, message: str, level: int = OK, **values: object) -> Status:

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from functools import partial
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.node.runtime import Runtime
 
 
-_LATELY_S, _TF_BEHIND_S, _MANY_FAULTS = 3.0, 1.0, 100
+_LATELY_S, _MANY_FAULTS = 3.0, 100
 _OF_ITS_OWN = {"overflow"}  # the verdict has a sentence for it
 Counts = Mapping[str, Mapping[str, int]]
 
@@ -86,17 +86,19 @@ class FactCollector:
         if not run.worker.waiting and node.now_ns:
             run.worker.offer(session.evaluate)
         if (check := run.ingest.check.job()) is not None:  # wrong units may keep the worker busy
-            run_in_thread(partial(_reported, check, node.report_fault))
+            run_in_thread(node.guarded(check))
         pipeline, counters = Counters(), Counters()
         pipeline.update(session.slam.counters)
         counters.update(run.counters)
         counters.update(pipeline)
         counted = counters.as_dict()
-        recent = self._recent.observe(time.monotonic(), run.clock.processed, run.counters.as_dict(), pipeline.as_dict())
+        recent = self._recent.observe(
+            time.monotonic(), run.publishers.processed, run.counters.as_dict(), pipeline.as_dict()
+        )
         inputs = run.subscriptions
         return Facts(
             lifecycle,
-            inputs.facts(node.now_ns, counted, recent, pipeline.used) if inputs is not None else (),
+            tuple(inputs.facts(node.now_ns, counted, recent, pipeline.used)) if inputs is not None else (),
             session.estimate,
             session.estimate.weakest(node.config.space) if session.estimate is not None else {},
             tuple(self._found(sum(of.get("overflow", 0) for of in counted.values()))),
@@ -117,8 +119,8 @@ class FactCollector:
             overflow=overflows, failures=session.failures, restarts=run.counters["node", "worker_restarted"]
         )
         lately, self._before = counts - self._before, counts
-        if run.preparation.fault:
-            yield error("not_compiled", text=run.preparation.fault)
+        if run.not_compiled:
+            yield error("not_compiled", text=run.not_compiled)
         elif self._not_loaded and not session.loaded_keyframes:
             yield error("not_loaded", text=self._not_loaded)
         elif not worker.is_alive:
@@ -128,23 +130,21 @@ class FactCollector:
         if node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) > 1:
             yield error("twin")  # which broadcasts map -> odom, too
         elif run.broadcaster is not None and node.config.tf.publish_tf:
-            yield from run.broadcaster.rivals()
+            yield from run.broadcaster.wrong()
         if gate.is_stopped:
             yield error("stopped")
         if session.recording_fails:
             yield error("unwritten")
-        if run.preparation.status:
-            yield note("preparing", text=run.preparation.status)
+        if run.preparing:
+            yield note("preparing", text=run.preparing)
         if session.loads:
             yield note("loading", text=session.loads)
         if node.get_parameter("use_sim_time").value and not node.now_ns:
             yield note("no_clock") if session.estimate is None else warning("no_clock")
-        if self._clock_stands(sum(run.clock.processed.values())):
+        if self._clock_stands(sum(run.publishers.processed.values())):
             yield warning("clock_stands")
         if gate.is_paused:
             yield warning("paused", text="paused")
-        if run.broadcaster is not None and run.broadcaster.behind_s > _TF_BEHIND_S:
-            yield warning("behind_last", value=run.broadcaster.behind_s)
         if failing := session.slam.view.failing:
             yield warning("unsolved", text=f"solves fail, the last good estimate stands: {failing}")
         elif lately["failures"]:
@@ -164,11 +164,3 @@ class FactCollector:
         if not now_ns or now_ns != self._clock_ns:
             self._clock_ns, self._stands_since = now_ns, now_s
         return now_s - self._stands_since > 2.0 and processed > before
-
-
-def _reported(work: Callable[[], None], on_fault: Callable[[Exception], None]) -> None:
-    """Do work in a thread, whose exception nobody else would see."""
-    try:
-        work()
-    except Exception as error:
-        on_fault(error)

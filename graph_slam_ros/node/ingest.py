@@ -12,44 +12,32 @@ from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
-from graph_slam_ros.findings.table import explain, remedy
+from graph_slam_ros.findings.finding import Finding
+from graph_slam_ros.findings.table import explain
 from graph_slam_ros.measurements.types import InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
-from graph_slam_ros.messages.from_msg import INITIAL_POSE, Decoder, MessageConverter, twist_of
+from graph_slam_ros.messages.from_msg import INITIAL_POSE, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.interfaces import message_class, typestore
-from graph_slam_ros.messages.to_msg import OK, WARN
+from graph_slam_ros.messages.to_msg import OK, WARN, Status
 from graph_slam_ros.node import events
-from graph_slam_ros.node.events import Outcome
 from graph_slam_ros.node.input_check import InputCheck
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
-from graph_slam_ros.node.publishers import Publishers, PublishingClock
-from graph_slam_ros.node.session import Session
-from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, Odometry
 from graph_slam_ros.slam.edits import SOURCE as EDITS
 from graph_slam_ros.slam.edits import removal
-from graph_slam_ros.slam.frontend.ingest_gate import JUMP_BACK_S, IngestGate, Passage
+from graph_slam_ros.slam.frontend.ingest_gate import JUMP_BACK_S, IngestGate
 
 if TYPE_CHECKING:
     from graph_slam_ros.node.node import GraphSlamNode
-
-OnJump = Callable[[Passage, str, str], None]
+    from graph_slam_ros.node.runtime import Runtime
 
 _PATIENCE_S = 1.0  # for the clock to reach a stamp
 _SHOWN = 80  # characters of a text that somebody has sent
 
 
 class Ingest:
-    """Passes measurements to the worker in order of arrival, or refuses and counts them.
-
-    All of it runs in the main thread.
-
-    Parameters
-    ----------
-    counters : of what is refused before the pipeline
-    on_jump : called where time jumped back, before anything of the new time goes on: with the decision of the gate,
-        what tells of the jump, and how
+    """Passes measurements to the worker in order of arrival, or refuses and counts them, all in the main thread.
 
     Attributes
     ----------
@@ -57,54 +45,36 @@ class Ingest:
     converter : makes measurements of messages
     gate : decides what a jump of time, a pause and a full queue mean
     extrapolator : the pose by the newest odometry
-    outcome : what became of the last ~/remove or initialpose that was not used; None before the first
+    outcome : what became of the last ~/remove or initialpose; None before the first
     """
 
-    def __init__(
-        self,
-        node: "GraphSlamNode",
-        config: Config,
-        counters: Counters,
-        session: Session,
-        worker: Worker,
-        publishers: Publishers,
-        clock: PublishingClock,
-        on_jump: OnJump,
-    ) -> None:
-        self._node, self._session, self._worker = node, session, worker
-        self._publishers, self._clock, self._on_jump = publishers, clock, on_jump
-        self._counters = counters
-        topics = {one.name: _full_topic(node, one.topic) for one in config.sources if one.name in uses(config)}
-        self.check = InputCheck(config, topics, counters)
-        self.converter = MessageConverter(config, counters, _installed(config))
+    def __init__(self, run: "Runtime", config: Config) -> None:
+        self._run, self._node = run, (node := run.node)
+        used = [one for one in config.sources if one.name in uses(config)]
+        types = {one.type for one in used} - set(typestore().types)  # whose layout only an installed package has
+        installed = {name: partial(deserialize_message, message_type=message_class(name)) for name in types}
+        self.check = InputCheck(config, {one.name: _full_topic(node, one.topic) for one in used}, run.counters)
+        self.converter = MessageConverter(config, run.counters, installed)
         self.converter.on_fault = node.get_logger().error
-        self.gate = IngestGate(counters, lambda: node.now_ns)
+        self.gate = IngestGate(run.counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
-        self.outcome: Outcome | None = None
+        self.outcome: Status | None = None
         self._future_stamps = FutureStamps(config.time.future_s, self._stamp_clock_ns, partial(self.refuse, "future"))
         self._publishes_odometry = False
         self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
-        self._clock_jumps: Any = None
-        create, guarded = node.create_subscription, node.guarded
         pose, text = message_class(results.POSE), message_class("std_msgs/msg/String")
         self._subscriptions = (
-            create(pose, "initialpose", guarded(self._on_initial_pose), 10, raw=True),
-            create(text, "~/remove", guarded(self._on_remove), 10),
+            node.create_subscription(pose, "initialpose", node.guarded(self._on_initial_pose), 10, raw=True),
+            node.create_subscription(text, "~/remove", node.guarded(self._on_remove), 10),
         )
-
-    def activate(self) -> None:
-        """Watch the clock for jumps."""
         back = Duration(nanoseconds=-round(JUMP_BACK_S * 1e9))
-        threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
-        clock, callback = self._node.get_clock(), self._node.guarded(self._on_clock_jump)
-        self._clock_jumps = clock.create_jump_callback(threshold, post_callback=callback)
-
-    def deactivate(self) -> None:
-        """Stop watching the clock for jumps."""
-        self._clock_jumps.unregister()
+        jump = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
+        on_jump = node.guarded(self._on_clock_jump)
+        self._clock_jumps = node.get_clock().create_jump_callback(jump, post_callback=on_jump)
 
     def finish(self) -> None:
         """Pass on or refuse all held messages, and unsubscribe."""
+        self._clock_jumps.unregister()
         for measured in self._future_stamps.due(patience_s=0.0):
             self.hand_over(measured)
         for subscription in self._subscriptions:
@@ -115,7 +85,7 @@ class Ingest:
         """Pass on the held messages that are due, ten times a second."""
         for measured in self._future_stamps.due():
             self.hand_over(measured)
-        self._publishes_odometry = self._publishers.has_subscribers("odometry")
+        self._publishes_odometry = self._run.publishers.has_subscribers("odometry")
 
     # -- measurements ------------------------------------------------------------------------------------------------
 
@@ -132,49 +102,49 @@ class Ingest:
 
     def hand_over(self, measured: Sequence[Measured]) -> None:
         """Pass a message to the worker unless the gate refuses it. A refused message is not accepted."""
-        passage = self.gate.admit(measured, self._node.config.time.on_jump, has_room=self._worker.has_room)
+        run = self._run
+        passage = self.gate.admit(measured, self._node.config.time.on_jump, has_room=run.worker.has_room)
         if passage.jump:
-            self._on_jump(passage, "stamps", "odometry has gone back in time and stays there")
+            run.begin_anew(passage, "stamps", "odometry has gone back in time and stays there")
         if passage.measured:
-            self._session.accept(passage.measured)
-            self._worker.offer(
-                partial(self._session.process, passage.measured),
-                partial(self._clock.after_message, passage.measured),
+            run.session.accept(passage.measured)
+            run.worker.offer(
+                partial(run.session.process, passage.measured),
+                partial(run.publishers.after_message, passage.measured),
             )
         else:
-            self._clock.refused += 1
+            run.publishers.refused += 1
 
     def refuse(self, reason: str, measured: Sequence[Measured]) -> None:
         """Count a message that is refused."""
         self.gate.refuse(reason, measured)
-        self._clock.refused += 1
-
-    # -- odometry in the map -----------------------------------------------------------------------------------------
+        self._run.publishers.refused += 1
 
     def _is_newest(self, m: Odometry) -> bool:
         """Return whether odometry is the newest. A message ahead of the clock would stay the newest for long."""
-        return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._session.estimate)
+        return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._run.session.estimate)
 
     def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:
-        estimate, frames, unused = self._session.estimate, self._node.config.frames, to_msg.UNUSED
+        estimate, frames, unused = self._run.session.estimate, self._node.config.frames, to_msg.UNUSED
         if estimate is None or not estimate.is_located:
             return
         twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
         pose, covariance = self.extrapolator.pose(estimate)
-        self._publishers.odometry(to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist))
+        message = to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist)
+        self._run.publishers.odometry(message)
 
-    # -- events ------------------------------------------------------------------------------------------------------
+    # -- what is asked for on a topic --------------------------------------------------------------------------------
 
     def in_sequence(self, events: Sequence[Control | InitialPose]) -> "Future[None]":
         """Accept and process an event at its place among the measurements."""
-        self._session.accept(events)
-        return self._worker.call(partial(self._session.process, events))
+        self._run.session.accept(events)
+        return self._run.worker.call(partial(self._run.session.process, events))
 
     def _on_initial_pose(self, cdr: bytes) -> None:
-        before = self._counters.as_dict()
+        before = self._run.counters.as_dict()
         poses = self.converter.initial_pose(cdr)
         if not poses:
-            self._report(INITIAL_POSE, "initialpose: not used", before, self._counters)
+            self._report(INITIAL_POSE, "initialpose: not used", before, self._run.counters)
         for pose in poses:
             self._publish_outcome("initialpose: used", is_done=True)
             self._node.in_background(self.in_sequence([pose]))
@@ -185,16 +155,17 @@ class Ingest:
         except GraphSlamError as error:
             self._publish_outcome(str(error), is_done=False)
             return
-        self._session.accept([event])
+        session = self._run.session
+        session.accept([event])
 
         def remove() -> None:
-            slam = self._session.slam
+            slam = session.slam
             before, known = slam.counters.as_dict(), list(slam.view.landmarks)
-            self._session.process([event])
+            session.process([event])
             near = did_you_mean(str(dict(event.values).get("landmark", "")), known)
             self._report(EDITS, f"~/remove: {message.data[:_SHOWN]}", before, slam.counters, near)
 
-        self._node.in_background(self._worker.call(remove))
+        self._node.in_background(self._run.worker.call(remove))
 
     def _report(
         self, source: str, what: str, before: Mapping[str, Mapping[str, int]], counters: Counters, near: str = ""
@@ -203,17 +174,17 @@ class Ingest:
         known, why = before.get(source, {}), list[str]()
         for reason, times in counters.as_dict().get(source, {}).items():
             if times > known.get(reason, 0) and reason != "removed":
-                mend = remedy(source, reason)
+                text = f"{explain(reason).meaning} ({reason})"
                 near = near * (reason == "unknown_landmark")
-                why.append(f"{explain(reason).meaning} ({reason}){mend and ': '}{mend}{near}")
+                why.append(f"{Finding(reason, 'warning', text=text, source=source)}{near}")
         self._publish_outcome(f"{what}: {'; '.join(why) or 'done'}", is_done=not why)
 
     def _publish_outcome(self, text: str, *, is_done: bool) -> None:
         """Log what became of it; say it on ~/events and, as the last, on /diagnostics: a topic has no answer."""
-        self.outcome = Outcome(text, is_done=is_done)
+        self.outcome = events.happened("asked", text, OK if is_done else WARN)
         if not is_done:
             self._node.get_logger().warn(text)
-        self._publishers.publish_events(self._node.now_ns, [events.happened("asked", text, OK if is_done else WARN)])
+        self._run.publishers.publish_events(self._node.now_ns, [self.outcome])
 
     # -- time --------------------------------------------------------------------------------------------------------
 
@@ -231,10 +202,10 @@ class Ingest:
         """Decide what to do after the clock jumped back, or was replaced by another."""
         self._future_stamps.forget_time()
         self.gate.clock_jumped(jump.delta.nanoseconds)
-        if self._session.estimate is None and not self._worker.waiting:
+        if self._run.session.estimate is None and not self._run.worker.waiting:
             return
         passage = self.gate.begin_anew(self._node.config.time.on_jump)
-        self._on_jump(passage, "clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
+        self._run.begin_anew(passage, "clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
 
 
 class FutureStamps:
@@ -295,9 +266,3 @@ def _full_topic(node: "GraphSlamNode", topic: str) -> str:
         return node.resolve_topic_name(topic)
     except Exception:  # rclpy raises what differs by version
         return topic
-
-
-def _installed(config: Config) -> dict[str, Decoder]:
-    """Decoders of types whose layout only an installed package has."""
-    names = {one.type for one in config.sources if one.name in uses(config)} - set(typestore().types)
-    return {name: partial(deserialize_message, message_type=message_class(name)) for name in names}

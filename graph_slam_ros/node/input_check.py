@@ -29,16 +29,7 @@ _PERIOD_S, _SOON_S, _SPARE = 3.0, 0.5, 50.0  # between two checks; of the time, 
 
 
 class InputCheck:
-    """Collects what is measured, and checks it in threads, one after the other.
-
-    Parameters
-    ----------
-    topics : full names of the topics of the inputs, by input
-
-    Attributes
-    ----------
-    findings : what is wrong with an input; empty where nothing is known to be wrong
-    """
+    """Collects what is measured, and checks it in threads, one after the other. ``findings`` is what is wrong now."""
 
     def __init__(self, config: Config, topics: Mapping[str, str], counters: Counters) -> None:
         self._collector = Collector(config, {**topics, TF_STATIC: "/tf_static"})
@@ -51,7 +42,7 @@ class InputCheck:
         self._last_ns: dict[str, int] = {}
         self._last_s: dict[str, float] = {}
         self._messages = 0  # since the last check
-        self._kept, self._left_out = 0, 0  # messages of odometry in this collection, and between them
+        self._kept = self._left_out = 0  # messages of odometry in this collection, and between them
         self._due_s, self._goes_on = 0.0, False
         self.findings: tuple[Finding, ...] = ()
 
@@ -62,7 +53,10 @@ class InputCheck:
         is_held = len(measured) > 1  # until now: its messages are collected already
         some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m) or is_held]
         if topic in self._odometry:
-            if (some or not measured) and self._is_due(topic):  # what was used is collected as it was used, too
+            now_s = time.monotonic()
+            is_due = now_s - self._last_s.get(topic, 0.0) >= _APART_S  # some of each second are enough
+            if (some or not measured) and is_due:  # what was used is collected as it was used, too
+                self._last_s[topic] = now_s
                 self._kept += 1
             else:
                 message = None
@@ -91,14 +85,6 @@ class InputCheck:
         if is_full:
             self.forget()
         return partial(self._check, columns, is_full=is_full, is_thinned=is_thinned)
-
-    def _is_due(self, topic: str) -> bool:
-        """Return whether a message of odometry is collected: some of each second are enough."""
-        now_s = time.monotonic()
-        if now_s - self._last_s.get(topic, 0.0) < _APART_S:
-            return False
-        self._last_s[topic] = now_s
-        return True
 
     def _is_next(self, m: Odometry) -> bool:
         """Return whether odometry is collected. What comes late is not: nor is it used."""

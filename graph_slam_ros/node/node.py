@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from typing import Any
@@ -20,16 +20,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import UInt64
 
 from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.node import bond, diagnostics
 from graph_slam_ros.node.parameters import changed, declare_parameters, files_for_others
-from graph_slam_ros.node.publishers import LATCHED
 from graph_slam_ros.node.runtime import Runtime
-from graph_slam_ros.node.services import serve_later, serve_maps
+from graph_slam_ros.node.services import SERVICES, serve_later, serve_maps
 from graph_slam_ros.node.worker import URGENT_S
 
 _SUCCESS, _FAILURE, _ERROR = (getattr(TransitionCallbackReturn, name) for name in ("SUCCESS", "FAILURE", "ERROR"))
@@ -43,11 +41,7 @@ class GraphSlamNode(LifecycleNode):
 
     Its topics are in ``messages/topics.py``. When configured, it has read its parameters, opened its run folder and
     made its publishers. Its kernels are loaded or compiled meanwhile. When active, it subscribes and broadcasts
-    map -> odom.
-
-    Parameters
-    ----------
-    is_stop_requested : called during long work that a stop may interrupt
+    map -> odom. During long work, ``is_stop_requested`` is asked.
     """
 
     def __init__(self, is_stop_requested: Callable[[], bool] = lambda: False, **options: Any) -> None:
@@ -56,7 +50,6 @@ class GraphSlamNode(LifecycleNode):
         for sentence in files_for_others(sys.argv, self.get_fully_qualified_name()):
             self.get_logger().warn(sentence)
         self.config = declare_parameters(self)
-        self.add_on_set_parameters_callback(self._on_set)
         self._run: Runtime | None = None
         self._bond: bond.Bond | None = None
         self._faults: deque[float] = deque(maxlen=1000)
@@ -64,23 +57,14 @@ class GraphSlamNode(LifecycleNode):
         self._verdict = diagnostics.Health("")
         self._logged_s = 0.0
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
-        self._acknowledge = self.create_publisher(UInt64, "~/received", LATCHED)
         self._diagnostics = self.create_publisher(
             message_class("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", 10
         )
         self.create_timer(_TICK_S, self.guarded(self._tick), clock=steady)
         self.create_timer(1.0, self.guarded(self._diagnose), clock=steady)
-        for name, start in (
-            ("save", lambda run: run.save()),
-            ("load", lambda run: run.load()),
-            ("reset", lambda run: run.reset()),
-            ("pause", lambda run: run.pause(True)),
-            ("resume", lambda run: run.pause(False)),
-            ("optimize", lambda run: run.control("optimize")),
-            ("clear_closures", lambda run: run.control("clear_closures")),
-        ):
+        for name, start in SERVICES.items():
             serve_later(self, f"~/{name}", partial(self._serve, start))
-        serve_maps(self, serve_later)
+        serve_maps(self)
         if not self.config.node.autostart and not bond.is_installed():
             self.get_logger().warn(bond.MISSING)
         for service in self.services:
@@ -123,9 +107,7 @@ class GraphSlamNode(LifecycleNode):
         try:
             action()
         except Exception as error:
-            self.get_logger().fatal(
-                message_of(error) if isinstance(error, GraphSlamError) else f"internal error, {message_of(error)}"
-            )
+            self.get_logger().fatal(_cause(error))
             return failed
         return _SUCCESS
 
@@ -133,7 +115,7 @@ class GraphSlamNode(LifecycleNode):
         if self._run is None:
             self._run = run = Runtime(self)
             run.prepare(self._is_stop_requested)
-            if self.config.journal.resume and run.was_cut_off:
+            if self.config.journal.resume and run.session.was_cut_off:
                 unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
                 self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
                 self.in_background(run.resume())
@@ -169,32 +151,23 @@ class GraphSlamNode(LifecycleNode):
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:
-        """Set parameters by rclpy after our own checks, whose refusals name the parameter.
+        """Set all or none by rclpy after our own checks, whose refusals name the parameter.
 
-        An integer is accepted for a float, as it is at the start.
+        An integer is accepted for a float, as it is at the start. While the node is configured, parameters take effect
+        at their place among the measurements.
         """
         try:
-            _, values = changed(self.config, parameter_list, is_configured=self._run is not None)
+            config, values = changed(self.config, parameter_list, is_configured=self._run is not None)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        return super().set_parameters_atomically(
+        result = super().set_parameters_atomically(
             [Parameter(one.name, value=values[one.name]) if one.name in values else one for one in parameter_list]
         )
-
-    def change(self, values: dict[str, Any]) -> None:
-        """Set parameters by name, as a ROS client would."""
-        self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
-
-    def _on_set(self, given: Sequence[Any]) -> SetParametersResult:
-        """Set all or none. Parameters that may change at run time take effect at their place among the measurements."""
-        try:
-            config, values = changed(self.config, given, is_configured=self._run is not None)
-        except ConfigError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        self.config = config
-        if self._run is not None and values:
-            self._run.set(values)
-        return SetParametersResult(successful=True)
+        if result.successful:
+            self.config = config
+            if self._run is not None and values:
+                self._run.set(values)
+        return result
 
     # -- the run -----------------------------------------------------------------------------------------------------
 
@@ -223,15 +196,6 @@ class GraphSlamNode(LifecycleNode):
         if self._run is None:
             raise GraphSlamError(f"not configured: the node is {self._state}")
         return self._run
-
-    def acknowledge(self, count: int) -> None:
-        """Publish the number of messages received, for a player."""
-        self._acknowledge.publish(UInt64(data=count))
-
-    @property
-    def has_player(self) -> bool:
-        """Return whether a player subscribes to the number of messages received."""
-        return self._acknowledge.get_subscription_count() > 0
 
     @property
     def now_ns(self) -> int:
@@ -281,7 +245,9 @@ class GraphSlamNode(LifecycleNode):
 
     def _diagnose(self) -> None:
         facts = (
-            diagnostics.Facts(self._state, faults=self.faults) if self._run is None else self._run.facts(self._state)
+            diagnostics.Facts(self._state, faults=self.faults)
+            if self._run is None
+            else self._run.facts.collect(self._state)
         )
         verdict = diagnostics.judge(facts, self.config)
         self._log(verdict)
@@ -299,15 +265,18 @@ class GraphSlamNode(LifecycleNode):
         if _kinds(before) == _kinds(verdict) and not urgent:
             return
         self._logged_s = time.monotonic()
-        line = "; ".join((verdict.state, *verdict.reasons))
         if verdict.level == to_msg.OK or (verdict.state == "WAITING" and not urgent):
-            self.get_logger().info(line)
+            self.get_logger().info(verdict.text)
         else:
-            self.get_logger().warn(line)
+            self.get_logger().warn(verdict.text)
 
 
 def _kinds(verdict: diagnostics.Health) -> list[str]:
     return [verdict.state, *(f"{one.code} {one.topic} {one.source}" for one in verdict.found)]
+
+
+def _cause(error: Exception) -> str:
+    return message_of(error) if isinstance(error, GraphSlamError) else f"internal error, {message_of(error)}"
 
 
 class _StopRequest:
@@ -357,12 +326,9 @@ def _run() -> int:
         node.finish(URGENT_S)
         executor.shutdown()
         node.destroy_node()
-    except GraphSlamError as error:
-        rclpy.logging.get_logger("graph_slam").fatal(str(error))
-        return 2
     except Exception as error:
-        rclpy.logging.get_logger("graph_slam").fatal(f"internal error, {message_of(error)}")
-        return 1
+        rclpy.logging.get_logger("graph_slam").fatal(_cause(error))
+        return 2 if isinstance(error, GraphSlamError) else 1
     finally:
         rclpy.try_shutdown()
     return 0

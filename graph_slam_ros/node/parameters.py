@@ -45,13 +45,7 @@ def declare_parameters(node: Any) -> Config:
 
 
 def files_for_others(arguments: Sequence[str], name: str) -> Iterator[str]:
-    """Yield a sentence on each parameter file of which nothing is for the node: ROS ignores it.
-
-    Parameters
-    ----------
-    arguments : of the process
-    name : full name of the node
-    """
+    """Yield a sentence on each parameter file in the arguments with nothing for a node of that name: ROS ignores it."""
     for option, file in pairwise(arguments):
         if option != "--params-file":
             continue
@@ -97,11 +91,12 @@ def _descriptor(p: Parameter) -> ParameterDescriptor:
     when = " May change at any time." if p.live else ""
     fixed = p.name in _AT_START
     descriptor = ParameterDescriptor(description=f"{p.meaning}{unit}.{choices}{when}", read_only=fixed)
-    if p.type is float and (p.low is not None or p.high is not None):
-        largest = sys.float_info.max
-        low, high = (-largest if p.low is None else p.low), (largest if p.high is None else p.high)
+    if p.low is None and p.high is None:
+        return descriptor
+    largest = sys.float_info.max if p.type is float else 2**31 - 1
+    low, high = -largest if p.low is None else p.low, largest if p.high is None else p.high
+    if p.type is float:
         descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
-    if p.type is int and (p.low is not None or p.high is not None):
-        low, high = int(p.low or 0), int(2**31 - 1 if p.high is None else p.high)
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    elif p.type is int:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import rclpy
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
@@ -44,11 +45,10 @@ _FIRST_PORT = 23_000
 _AHEAD = 256  # messages on their way
 _OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
 _CLOCK_NS = 5_000_000
-_PATIENCE_S = 10.0
-_PARAMETERS_S, _SAVE_S = 1.0, 300.0
+_PATIENCE_S, _SAVE_S = 10.0, 300.0
+_SPIN_S = 0.05
 _START_S = 300.0  # the first start of an installation compiles
 _OWN_LAG_S = 60.0  # the player waits for its own node: that it is behind is no fault
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class PlayError(GraphSlamError):
@@ -82,9 +82,14 @@ class Player:
         self._on_the_way: dict[str, tuple[int, int]] = {}  # oldest and newest stamp by topic
         self._clock_ns = 0
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
-        self._saving = self._node.create_client(Trigger, f"{node_name}/save")
-        self._publishers = {topic: self._publisher(topic) for topic in set(inputs.topics.values())}
-        self._node.create_subscription(UInt64, f"{node_name}/received", self._on_received, _LATCHED)
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publishers = {
+            topic: self._node.create_publisher(
+                message_class(bag.topics[topic].type), topic, latched if topic == self._static else 4 * _AHEAD
+            )
+            for topic in set(inputs.topics.values())
+        }
+        self._node.create_subscription(UInt64, f"{node_name}/received", self._on_received, latched)
 
     def play(self, rate: float | None, progress: Callable[[Iterable[Any], int], Iterable[Any]]) -> Played:
         """Send everything, wait until it has arrived, and make the node save it.
@@ -96,10 +101,10 @@ class Player:
         patience_s = _START_S if self._own else _PATIENCE_S
         self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?", patience_s)
         for topic, publisher in self._publishers.items():
-            self._wait(publisher.get_subscription_count, f"nobody subscribes to {topic}")
+            self._wait(publisher.get_subscription_count, f"nobody subscribes to {topic}", _PATIENCE_S)
         for message in self._bag.messages({self._static} if self._static else ()):
-            self._send(message)
-        self._wait_until_received()
+            self._send(message, self._stamp_ns(message))
+        self._until_received(self._sent)
         total = sum(self._bag.topics[topic].count for topic in self._topics)
         start_wall, start_log = time.monotonic(), None
         for message in progress(self._bag.messages(self._topics), total):
@@ -107,22 +112,17 @@ class Player:
                 continue  # one node alone broadcasts map -> odom: now it is ours
             start_log = message.log_ns if start_log is None else start_log
             if rate:
-                self._pause(start_wall + (message.log_ns - start_log) * 1e-9 / rate)
-            self._keep_order(message)
-            self._send(message)
-        self._wait_until_received()
+                until = start_wall + (message.log_ns - start_log) * 1e-9 / rate
+                _spin_until(self._node, lambda: False, until - time.monotonic())
+            stamp_ns = self._stamp_ns(message)
+            self._keep_order(message.topic, stamp_ns)
+            self._send(message, stamp_ns)
+        self._until_received(self._sent)
         return Played(self._sent, self._lost, self._save())
 
     def close(self) -> None:
         """Leave the graph."""
         self._node.destroy_node()
-
-    def _publisher(self, topic: str) -> Any:
-        kind = message_class(self._bag.topics[topic].type)
-        latched = topic == self._static
-        return self._node.create_publisher(
-            kind, topic, QoSProfile(depth=100, durability=_LATCHED.durability) if latched else 4 * _AHEAD
-        )
 
     def _on_received(self, message: UInt64) -> None:
         if self._before is None:
@@ -131,25 +131,23 @@ class Player:
         if self._received + self._lost >= self._sent:
             self._on_the_way.clear()
 
-    def _send(self, message: BagMessage) -> None:
+    def _send(self, message: BagMessage, stamp_ns: int) -> None:
         if message.log_ns - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = message.log_ns
             self._clock.publish(to_msg.clock(message.log_ns))
         self._publishers[message.topic].publish(message.cdr)
         self._sent += 1
-        stamp_ns = self._stamp_ns(message)
         oldest, newest = self._on_the_way.get(message.topic, (stamp_ns, stamp_ns))
         self._on_the_way[message.topic] = min(oldest, stamp_ns), max(newest, stamp_ns)
 
-    def _keep_order(self, message: BagMessage) -> None:
+    def _keep_order(self, topic: str, stamp_ns: int) -> None:
         """Wait while the queues are full, or while the order of arrival of two topics would matter."""
-        stamp_ns = self._stamp_ns(message)
-        others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
+        others = [stamps for other, stamps in self._on_the_way.items() if other != topic]
         apart = self._overtake_ns
         if any(stamp_ns - oldest >= apart or newest - stamp_ns >= apart for oldest, newest in others):
-            self._wait_until_received()
+            self._until_received(self._sent)
         elif self._sent - self._received - self._lost >= _AHEAD:
-            self._until_received(self._sent - self._lost - _AHEAD // 2)
+            self._until_received(self._sent - _AHEAD // 2)
 
     def _stamp_ns(self, message: BagMessage) -> int:
         """The stamp of the header, or of the first in a list; 0 if the message is too short for one."""
@@ -161,33 +159,20 @@ class Player:
         except struct.error:
             return 0
 
-    def _wait_until_received(self) -> None:
-        self._until_received(self._sent - self._lost)
-
     def _until_received(self, count: int) -> None:
         """Wait for this number of messages. What does not arrive while nothing changes is counted as lost."""
-        last, deadline = self._received, time.monotonic() + _PATIENCE_S
-        while self._received < count:
-            rclpy.spin_once(self._node, timeout_sec=0.1)
-            self._check_node()
-            if self._received != last:
-                last, deadline = self._received, time.monotonic() + _PATIENCE_S
-            elif time.monotonic() > deadline:
-                self._lost += count - self._received
+        while (missing := count - self._lost - self._received) > 0:
+            has_come = partial(self._has_received_since, self._received)
+            if not _spin_until(self._node, has_come, _PATIENCE_S, self._check_node):
+                self._lost += missing
                 self._on_the_way.clear()
-                return
 
-    def _pause(self, until: float) -> None:
-        while (left := until - time.monotonic()) > 0.0:
-            rclpy.spin_once(self._node, timeout_sec=left)
+    def _has_received_since(self, count: int) -> bool:
+        return self._received != count
 
-    def _wait(self, condition: Callable[[], object], complaint: str, patience_s: float = _PATIENCE_S) -> None:
-        deadline = time.monotonic() + patience_s
-        while not condition():
-            self._check_node()
-            if time.monotonic() > deadline:
-                raise PlayError(complaint)
-            rclpy.spin_once(self._node, timeout_sec=0.05)
+    def _wait(self, condition: Callable[[], object], complaint: str, patience_s: float) -> None:
+        if not _spin_until(self._node, condition, patience_s, self._check_node):
+            raise PlayError(complaint)
 
     def _check_node(self) -> None:
         code = self._own.poll() if self._own else None
@@ -195,64 +180,79 @@ class Player:
             raise PlayError(f"the node ended with exit code {code}")
 
     def _save(self) -> str:
-        if not self._saving.wait_for_service(timeout_sec=_PATIENCE_S):
-            raise PlayError(f"no service {self._name}/save")
-        answer = _answer(self._node, self._saving, Trigger.Request(), _SAVE_S, _PATIENCE_S, self._check_node)
-        if answer is None or not answer.success:
-            raise PlayError(f"{self._name}/save: {answer.message if answer else 'no answer'}")
+        of, patience = (Trigger, f"{self._name}/save", Trigger.Request()), (_SAVE_S, _PATIENCE_S)
+        answer = _answer(self._node, *of, *patience, self._check_node)
+        if not answer.success:
+            raise PlayError(f"{self._name}/save: {answer.message}")
         return str(answer.message)
 
 
+def _spin_until(
+    node: Node, condition: Callable[[], object], patience_s: float, check: Callable[[], None] = lambda: None
+) -> bool:
+    """Spin until a condition holds; False if it does not in that time. What ``check`` raises meanwhile ends it."""
+    deadline = time.monotonic() + patience_s
+    while not condition():
+        check()
+        if (left_s := deadline - time.monotonic()) <= 0.0:
+            return False
+        rclpy.spin_once(node, timeout_sec=min(left_s, _SPIN_S))
+    return True
+
+
 def _answer(
-    node: Node, client: Any, request: Any, patience_s: float, again_s: float, check: Callable[[], None] = lambda: None
+    node: Node,
+    kind: Any,
+    service: str,
+    request: Any,
+    patience_s: float = _PATIENCE_S,
+    again_s: float = 1.0,
+    check: Callable[[], None] = lambda: None,
 ) -> Any:
-    """Ask, and ask again, until there is an answer; None if there is none.
+    """Ask, and ask again after a while and after twice as long, until there is an answer.
 
     DDS drops an answer while the node does not know who asked, which may be so on a busy machine.
-
-    Parameters
-    ----------
-    again_s : after which it is asked a second time; then twice as long, and so on
-    check : called meanwhile; what it raises ends the wait
-    """
-    deadline, asked = time.monotonic() + patience_s, list[Any]()
-    while not (done := [one for one in asked if one.done()]) and time.monotonic() < deadline:
-        asked.append(client.call_async(request))
-        until, again_s = min(deadline, time.monotonic() + again_s), 2.0 * again_s
-        while time.monotonic() < until and not any(one.done() for one in asked):
-            check()
-            rclpy.spin_once(node, timeout_sec=0.1)
-    return done[0].result() if done else None
-
-
-def config_of(node_name: str) -> Config:
-    """The configuration of a running node, read from its parameters.
 
     Raises
     ------
     PlayError
-        There is no such node.
+        There is no such service, or no answer.
     """
+    client = node.create_client(kind, service)
+    if not client.wait_for_service(timeout_sec=_PATIENCE_S):
+        raise PlayError(f"no {service}: is the node running?")
+    asked, deadline = list[Any](), time.monotonic() + patience_s
+    while (left_s := deadline - time.monotonic()) > 0.0:
+        asked.append(client.call_async(request))
+        if _spin_until(node, lambda: any(one.done() for one in asked), min(again_s, left_s), check):
+            return next(one.result() for one in asked if one.done())
+        again_s *= 2.0
+    raise PlayError(f"{service}: no answer")
+
+
+@contextmanager
+def _ros() -> Iterator[None]:
     rclpy.init(args=[])
     try:
-        node = Node("graph_slam_player")
-
-        def answer(kind: Any, service: str, **fields: Any) -> Any:
-            client = node.create_client(kind, f"{node_name}/{service}")
-            if not client.wait_for_service(timeout_sec=_PATIENCE_S):
-                raise PlayError(f"no parameters of {node_name}: is the node running?")
-            found = _answer(node, client, kind.Request(**fields), _PATIENCE_S, _PARAMETERS_S)
-            if found is None:
-                raise PlayError(f"{node_name}/{service}: no answer")
-            return found
-
-        there = set(answer(ListParameters, "list_parameters").result.names)
-        (inputs,) = answer(GetParameters, "get_parameters", names=["inputs.names"]).values
-        names = [p.name for p in parameters(inputs.string_value.split()) if p.name in there]
-        values = answer(GetParameters, "get_parameters", names=names).values
-        return Config.from_mapping(dict(zip(names, map(parameter_value_to_python, values), strict=True)))
+        yield
     finally:
         rclpy.try_shutdown()
+
+
+def config_of(node_name: str) -> Config:
+    """The configuration of a running node, read from its parameters. Raises PlayError if there is no such node."""
+    with _ros():
+        node = Node("graph_slam_player")
+
+        def get(names: list[str]) -> list[Any]:
+            request = GetParameters.Request(names=names)
+            values = _answer(node, GetParameters, f"{node_name}/get_parameters", request).values
+            return list(map(parameter_value_to_python, values))
+
+        listed = _answer(node, ListParameters, f"{node_name}/list_parameters", ListParameters.Request())
+        there, (inputs,) = set(listed.result.names), get(["inputs.names"])
+        names = [p.name for p in parameters(inputs.split()) if p.name in there]
+        return Config.from_mapping(dict(zip(names, get(names), strict=True)))
 
 
 def play(
@@ -266,15 +266,12 @@ def play(
     progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda items, total: items,
 ) -> Played:
     """Play a recording into the running node of that name, or into one of our own (``own_node``)."""
-    rclpy.init(args=[])
-    try:
+    with _ros():
         player = Player(bag, inputs, node_name, config or Config(), own)
         try:
             return player.play(rate, progress)
         finally:
             player.close()
-    finally:
-        rclpy.try_shutdown()
 
 
 @contextmanager

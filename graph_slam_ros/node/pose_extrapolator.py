@@ -44,13 +44,10 @@ class PoseExtrapolator:
         return self._selector.used.source if self._selector.used else ""
 
     def on_odometry(self, m: Odometry, estimate: Estimate | None) -> bool:
-        """Add an odometry message. Return whether there is a pose at it.
-
-        There is none at a message of a source that is not in use, or that is not newer than the last.
-        """
+        """Add an odometry message. Return whether there is a pose at it: it is newer, and of the source in use."""
+        used = self._selector.used
         if estimate is not None and estimate.source != m.source:
             return False
-        used = self._selector.used
         if used is not None and m.source == used.source and m.stamp_ns <= used.stamp_ns:
             return False
         if used is not None and m.source != used.source:

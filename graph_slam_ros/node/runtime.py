@@ -12,19 +12,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.config.config import with_survey
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, message_of
+from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.measurements.types import Event
-from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.fact_collector import FactCollector
 from graph_slam_ros.node.ingest import Ingest
-from graph_slam_ros.node.preparation import Preparation
-from graph_slam_ros.node.publishers import Publishers, PublishingClock
+from graph_slam_ros.node.publishers import Publishers
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
 from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
 from graph_slam_ros.node.worker import Worker
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Update
+from graph_slam_ros.runs.folder import incomplete_runs
+from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.slam.frontend.ingest_gate import Passage
+from graph_slam_ros.warmup import Compiling, are_compiled, warmup
 
 if TYPE_CHECKING:
     from graph_slam_ros.node.node import GraphSlamNode
@@ -35,65 +36,73 @@ _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a 
 class Runtime:
     """The parts of the node from configuration to clean-up, and the services on the run.
 
-    Parameters
-    ----------
-    node : the ``GraphSlamNode``
-
     Attributes
     ----------
     counters : of what is refused before the pipeline; those of the pipeline belong to the worker's thread
+    preparing : how far the kernels are that the worker loads or compiles before anything else; empty when they are
+    not_compiled : why they cannot be; empty where they can
+    subscriptions, broadcaster : None while the node is not active
     """
 
     def __init__(self, node: "GraphSlamNode") -> None:
         config = with_survey(node.config)
-        self.node = node
-        self.counters = Counters()
+        self.node, self.counters = node, Counters()
         self.counters.on_first = self._warn
-        with contextlib.ExitStack() as undo:  # what cannot be configured holds neither the run folder nor a topic
-            self.session = Session(config, self.counters, self._on_update, self._warn)
-            undo.callback(self.session.abandon)
-            self.publishers = Publishers(node, config)
-            undo.callback(self.publishers.close)
-            self.worker = Worker(config.inputs.queue, node.report_fault, self._on_exit_of_a_job)
-            undo.callback(self.worker.stop, 0.0)
-            self.clock = PublishingClock(node, self.session, self.publishers, self.worker)
-            self.ingest = Ingest(
-                *(node, config, self.counters, self.session, self.worker),
-                *(self.publishers, self.clock, self._begin_anew),
-            )
-            undo.pop_all()
-        self._facts = FactCollector(self)
-        self.preparation = Preparation(node.get_logger(), config.world.dimensions)
-        for run in self.session.incomplete:
-            node.get_logger().warn(f"{run.name}: stopped while measurements waited: graph_slam recover {run}")
+        self.preparing = self.not_compiled = ""
+        self._is_ending = False
         self.subscriptions: Subscriptions | None = None
         self.broadcaster: TfBroadcaster | None = None
+        with contextlib.ExitStack() as undo:  # what cannot be configured holds neither the run folder nor a topic
+            self.publishers = Publishers(self)
+            undo.callback(self.publishers.close)
+            self.session = Session(config, self.counters, self.publishers.on_update, self._warn)
+            undo.callback(self.session.abandon)
+            self.worker = Worker(config.inputs.queue, node.report_fault, self._on_exit_of_a_job)
+            undo.callback(self.worker.stop, 0.0)
+            self.ingest = Ingest(self, config)
+            undo.pop_all()
+        self.facts = FactCollector(self)
+        for run in incomplete_runs(Path(config.output.folder)) if config.output.folder else ():
+            node.get_logger().warn(f"{run.name}: stopped while measurements waited: graph_slam recover {run}")
 
     def prepare(self, is_stop_requested: Callable[[], bool]) -> None:
-        """Make the worker load or compile the kernels before anything else."""
+        """Make the worker load or compile the kernels before anything else. Without them it starts no further job."""
+        log, dimensions = self.node.get_logger(), self.node.config.world.dimensions
+        self.preparing = "loading kernels"
+
+        def note(progress: Compiling) -> None:
+            self.preparing = str(progress)
 
         def prepare() -> None:
-            if not self.preparation.run(is_stop_requested):
+            if not are_compiled(dimensions):
+                log.info("compiling kernels, once per installation: about a minute")
+            try:
+                elapsed_s = warmup(lambda: self._is_ending or is_stop_requested(), note, dimensions)
+            except GraphSlamError as error:  # stopped on request; the next start continues from there
+                log.info(str(error))
                 self.worker.leave()
+            except Exception as error:
+                self.not_compiled = message_of(error)
+                log.error(str(Finding("not_compiled", "error", text=self.not_compiled)))
+                self.worker.leave()
+            else:
+                self.preparing = ""
+                log.info(f"kernels ready after {elapsed_s:.1f} s")
 
         self.worker.call(prepare)
 
     def activate(self) -> None:
         """Subscribe and broadcast. A second call changes nothing."""
-        if self.subscriptions is not None:
-            return
-        node, ingest = self.node, self.ingest
-        self.broadcaster = TfBroadcaster(node, self.session, ingest)
-        self.subscriptions = Subscriptions(node, node.config, ingest, self.broadcaster, self.counters)
-        ingest.activate()
+        if self.subscriptions is None:
+            self.broadcaster = TfBroadcaster(self)
+            self.subscriptions = Subscriptions(self, self.broadcaster)
 
     def deactivate(self) -> None:
         """Unsubscribe and stop broadcasting."""
-        if self.subscriptions is None or self.broadcaster is None:
-            return
-        self.subscriptions.close()
-        self.broadcaster.close()
-        self.ingest.deactivate()
+        if self.broadcaster is not None:
+            self.broadcaster.close()
+        if self.subscriptions is not None:
+            self.subscriptions.close()
         self.subscriptions = self.broadcaster = None
 
     def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
@@ -102,7 +111,7 @@ class Runtime:
         The next start completes what takes longer, because all accepted measurements are in the journal.
         """
         self.deactivate()
-        self.preparation.stop()
+        self._is_ending = True
         self.ingest.finish()
         saved = self.worker.call(self.session.finish)
         try:
@@ -125,23 +134,15 @@ class Runtime:
         if lost:
             log.error(f"{lost} measurements are lost: they came while another run was to begin, and it had not yet")
 
-    # -- in the main thread ------------------------------------------------------------------------------------------
-
     def tick(self) -> None:
-        """Do what is due ten times a second."""
+        """Do what is due ten times a second, in the main thread."""
         self.session.flush_in_background()
         self.ingest.tick()
         if self.subscriptions is not None:
             self.subscriptions.tick(self.node.now_ns)
-        self.clock.tick()
+        self.publishers.tick()
 
-    def _on_exit_of_a_job(self) -> None:
-        """Continue from the last good estimate after an exception that would have ended the thread."""
-        self.counters.count("node", "worker_restarted")
-        self.node.get_logger().error("a job has ended the solver's thread; it goes on with the graph that there is")
-        self.session.slam.restart()
-
-    def _begin_anew(self, passage: Passage, source: str, why: str) -> None:
+    def begin_anew(self, passage: Passage, source: str, why: str) -> None:
         """Carry out the gate's decision on a jump of time."""
         self._warn(source, f"{why}: {passage.jump}")
         self.ingest.forget_time()
@@ -153,45 +154,34 @@ class Runtime:
         elif passage.events:
             self.node.in_background(self.ingest.in_sequence(passage.events))
 
+    def _on_exit_of_a_job(self) -> None:
+        """Continue from the last good estimate after an exception that would have ended the thread."""
+        self.counters.count("node", "worker_restarted")
+        self.node.get_logger().error("a job has ended the solver's thread; it goes on with the graph that there is")
+        self.session.slam.restart()
+
     def _warn(self, source: str, reason: str) -> None:
         self.node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (logged once, counted from now on)")
-
-    def _on_update(self, slam: GraphSlam, update: Update) -> None:
-        """Publish what an update changed, in the worker's thread."""
-        self.clock.on_update(slam, update)
-
-    def facts(self, lifecycle: str) -> Facts:
-        """Collect the facts from which the state of the node is judged."""
-        return self._facts.collect(lifecycle)
 
     # -- services: begun here, done by the worker --------------------------------------------------------------------
 
     def save(self, config: Config | None = None) -> "Future[str]":
         """Solve everything, and write the run folder and the map under its configured name."""
-        if status := self.preparation.status:
-            raise GraphSlamError(f"nothing to save yet: {status}; what has come is in the journal")
+        if self.preparing:
+            raise GraphSlamError(f"nothing to save yet: {self.preparing}; what has come is in the journal")
         self.ingest.hand_over(self.ingest.converter.finish(is_end=False))
         name = (config or self.node.config).output.save_as
         return self.worker.call(partial(self.session.save, self.session.accept_save(), name))
 
-    @property
-    def was_cut_off(self) -> bool:
-        """Return whether the last run never ended: its map can be loaded."""
-        return self.session.was_cut_off
-
-    def check_map(self, name: str) -> None:
-        """Raise RunError if no run of that name can be loaded."""
-        self.session.earlier(name)
-
     def load(self, config: Config | None = None) -> "Future[str]":
         """Continue from an earlier run, with the robot at the configured pose."""
-        output, pose = (config or self.node.config).output, (config or self.node.config).load_pose
-        return self._begin_run(partial(self.session.load, output.load, pose))
+        config = config or self.node.config
+        return self._begin_run(partial(self.session.load, config.output.load, config.load_pose))
 
     def load_at_start(self) -> None:
         """Load the configured map. If it cannot be loaded, that is a state until another is."""
         loaded = self.load()
-        loaded.add_done_callback(self._facts.note_load)
+        loaded.add_done_callback(self.facts.note_load)
         self.node.in_background(loaded)
 
     def resume(self) -> "Future[str]":
@@ -212,11 +202,11 @@ class Runtime:
                 done = job()
             finally:
                 self.session.release()
-            slam = self.session.slam
-            if slam.view.datum:
-                self.ingest.converter.begin_at(slam.view.datum)
-            self.publishers.begin(self.node.config, has_map=bool(slam.view.keyframes))
-            self.publishers.publish_due(slam.view)
+            view = self.session.slam.view
+            if view.datum:
+                self.ingest.converter.begin_at(view.datum)
+            self.publishers.begin(has_map=bool(view.keyframes))
+            self.publishers.publish_due()
             return done
 
         return self.worker.call(begin)
@@ -228,8 +218,13 @@ class Runtime:
 
     def control(self, event: Event) -> "Future[str]":
         """Process an event at its place in the ingest sequence."""
-        self.session.accept([asked := Control(event)])
-        return self.worker.call(partial(self.session.control, asked))
+        self.session.accept(events := [Control(event)])
+
+        def process() -> str:
+            self.session.process(events)
+            return f"{len(self.session.slam.view.keyframes)} keyframes"
+
+        return self.worker.call(process)
 
     def set(self, values: dict[str, Any]) -> None:
         """Change parameters at this place in the ingest sequence."""

@@ -3,16 +3,31 @@
 import math
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 
 if TYPE_CHECKING:
     from graph_slam_ros.node.node import GraphSlamNode
+    from graph_slam_ros.node.runtime import Runtime
+
+
+SERVICES: "dict[str, Callable[[Runtime], Future[str]]]" = {
+    "save": lambda run: run.save(),
+    "load": lambda run: run.load(),
+    "reset": lambda run: run.reset(),
+    "pause": lambda run: run.pause(True),
+    "resume": lambda run: run.pause(False),
+    "optimize": lambda run: run.control("optimize"),
+    "clear_closures": lambda run: run.control("clear_closures"),
+}
+"""What is asked of a configured node by ``std_srvs/Trigger``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,23 +67,19 @@ def serve_later(
     send = service.send_response
 
     def send_when_done(response: Any, header: Any) -> None:
-        if isinstance(response, _Later):
-            response.future.add_done_callback(lambda future: _send(send, filled(response.response, future), header))
-        else:
+        if not isinstance(response, _Later):
             send(response, header)
+            return
 
-    def filled(response: Any, future: "Future[str]") -> Any:
-        error = future.exception()
-        return answer(response, future.result() if error is None else "", error)
+        def answer_now(future: "Future[str]") -> None:
+            error = future.exception()
+            filled = answer(response.response, future.result() if error is None else "", error)
+            with suppress(Exception):  # the node, or who asked, has gone in the meantime
+                send(filled, header)
+
+        response.future.add_done_callback(answer_now)
 
     service.send_response = send_when_done
-
-
-def _send(send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
-    try:
-        send(response, header)
-    except Exception:  # the node, or who asked, has gone in the meantime
-        return
 
 
 _GIVEN_POSE, _LOCALIZE = 2, 3  # match_type of slam_toolbox/srv/DeserializePoseGraph
@@ -87,13 +98,7 @@ def saved_as(request: Any) -> Values:
 
 
 def loaded_from(request: Any, dimensions: int) -> Values:
-    """Convert a DeserializePoseGraph request into parameters.
-
-    Raises
-    ------
-    ConfigError, MatchTypeError
-        No name; no start pose, or an orientation that is none.
-    """
+    """Convert a DeserializePoseGraph request into parameters. Raises ConfigError without a name, or MatchTypeError."""
     if request.match_type not in (_GIVEN_POSE, _LOCALIZE):
         raise MatchTypeError(
             f"match_type: {request.match_type} gives no pose: ask for START_AT_GIVEN_POSE (2) or LOCALIZE_AT_POSE (3)"
@@ -103,8 +108,8 @@ def loaded_from(request: Any, dimensions: int) -> Values:
     return {"output.load": _name(request), "output.load_pose": pose, "map.localize": localizes}
 
 
-def serve_maps(node: "GraphSlamNode", serve_later: Callable[..., None]) -> None:
-    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed, by ``services.serve_later``."""
+def serve_maps(node: "GraphSlamNode") -> None:
+    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed."""
     try:
         types = import_module("slam_toolbox.srv")
     except ImportError:
@@ -112,15 +117,14 @@ def serve_maps(node: "GraphSlamNode", serve_later: Callable[..., None]) -> None:
 
     def save(request: Any) -> "Future[str]":
         config = node.config.changed(saved_as(request))
-        run = node.configured()
-        return run.save(config)
+        return node.configured().save(config)
 
     def load(request: Any) -> "Future[str]":
         config = node.config.changed(loaded_from(request, node.config.world.dimensions))
         run = node.configured()
-        run.check_map(config.output.load)  # before anything changes
+        run.session.earlier(config.output.load)  # before anything changes
         if config.map.localize != node.config.map.localize:
-            node.change({"map.localize": config.map.localize})
+            node.set_parameters_atomically([Parameter("map.localize", value=config.map.localize)])
         return run.load(config)
 
     def answer(response: Any, message: str, error: BaseException | None) -> Any:

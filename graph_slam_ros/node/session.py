@@ -24,7 +24,6 @@ from graph_slam_ros.runs.folder import (
     CONFIG,
     RunError,
     earlier_runs,
-    incomplete_runs,
     is_cut_off,
     is_name_of_earlier,
     is_run,
@@ -43,13 +42,7 @@ OnUpdate = Callable[[GraphSlam, Update], None]
 
 
 class Session:
-    """The pipeline with its recording.
-
-    Parameters
-    ----------
-    border : counters of what was refused before it came here: they are saved with the run
-    on_update : called with what an update changed
-    """
+    """The pipeline with its recording, and the counters of what was refused at the border, which are saved with it."""
 
     def __init__(self, config: Config, border: Counters, on_update: OnUpdate, warn: Callable[[str, str], None]) -> None:
         self.config = config
@@ -98,11 +91,6 @@ class Session:
         self._fit, self._fitted_at, self._fit_due_s, self._doubted = float("nan"), 0, 0.0, tuple[Finding, ...]()
 
     @property
-    def incomplete(self) -> list[Path]:
-        """Earlier runs that ended while measurements were in the queue, and whose results are not complete."""
-        return incomplete_runs(self._folder) if self._folder is not None else []
-
-    @property
     def failures(self) -> int:
         """The number of failed solves."""
         return sum(self.slam.counters.as_dict().get("solver", {}).values())
@@ -115,9 +103,8 @@ class Session:
         with self._accepting:
             if self._held:
                 self._held[-1] += measurements
-            elif (recorder := self._recorder) is not None:
-                for measurement in measurements:
-                    recorder.accept(measurement)
+            else:
+                self._write_accepted(measurements)
 
     def hold(self) -> None:
         """Hold accepted measurements until ``release``: they belong to the next run."""
@@ -128,10 +115,12 @@ class Session:
     def release(self) -> None:
         """Write the held measurements, now that the run has begun or the previous one goes on."""
         with self._accepting:
-            held = self._held.popleft()
-            if (recorder := self._recorder) is not None:
-                for measurement in held:
-                    recorder.accept(measurement)
+            self._write_accepted(self._held.popleft())
+
+    def _write_accepted(self, measurements: Sequence[Measurement]) -> None:
+        if (recorder := self._recorder) is not None:
+            for measurement in measurements:
+                recorder.accept(measurement)
 
     def flush_in_background(self) -> None:
         """Write accepted measurements to disk even while the worker is busy."""
@@ -270,11 +259,6 @@ class Session:
 
     # -- services ----------------------------------------------------------------------------------------------------
 
-    def control(self, event: Control) -> str:
-        """Process an event that was accepted."""
-        self.process([event])
-        return f"{len(self.slam.view.keyframes)} keyframes"
-
     def accept_save(self) -> list[Control]:
         """The events that come before a save in the journal; none if nothing is new."""
         events = [Control("flush"), Control("optimize")] if self._has_news else []
@@ -283,37 +267,30 @@ class Session:
         return events
 
     def save(self, events: Sequence[Control] | None = None, name: str = "") -> str:
-        """Process held measurements, solve, and write the run folder; returns its name.
+        """Process the events accepted for it, or accept them now, and write the run folder; returns its name.
 
-        Parameters
-        ----------
-        events : that were accepted for it; None: they are accepted now
-        name : the name of a second run folder in the same directory, which gets the map, too; empty: none
+        A second run folder with the given name in the same directory gets the map, too.
         """
         self._recorded(RunRecorder.join_sync)  # what the disk refused before is reported, and is no reason not to save
         self.process(self.accept_save() if events is None else events)
         folder = self._write(ended=False)
-        return f"{folder}, {self._save_as(Path(folder), name)}" if name else folder
-
-    def _save_as(self, folder: Path, name: str) -> Path:
-        """Write the map as a run next to the folder, which is already saved."""
-        if is_name_of_earlier(folder, name):
-            raise RunError(
-                f"{folder.name} is saved; {name}: earlier runs are called so, and are removed: choose another name"
-            )
+        if not name:
+            return str(folder)
         out = folder.with_name(name)
         try:
+            if is_name_of_earlier(folder, name):
+                raise RunError(f"{name}: earlier runs are called so, and are removed: choose another name")
             save_copy(self.slam.view, out, folder)
         except GraphSlamError as error:
             raise RunError(f"{folder.name} is saved; {error}") from None
-        return out
+        return f"{folder}, {out}"
 
-    def _write(self, *, ended: bool) -> str:
+    def _write(self, *, ended: bool) -> Path:
         if self._recorder is None:
             why = "recording was stopped" if self._folder else "output.folder is empty"
             raise GraphSlamError(f"{why}: nowhere to save")
         summary = summarize(self.slam) | account(self.slam, self._counters()) | {"ended": ended}
-        folder = str(self._recorder.save(self.slam, summary))
+        folder = self._recorder.save(self.slam, summary)
         self._is_saved, self._is_ended, self.recording_fails = True, ended, False
         return folder
 
@@ -325,50 +302,41 @@ class Session:
         return saved
 
     def load(self, name: str, T_map_base: Numbers | None = None) -> str:
-        """Save, keep that run, and continue from an earlier one.
-
-        Parameters
-        ----------
-        T_map_base : where the robot is in its map; None: unknown
-        """
+        """Save, keep that run, and continue from an earlier one, where the robot is at a pose or at an unknown one."""
         return self._load(self.earlier(name), T_map_base)
 
     def resume(self) -> str:
         """Continue from the run that was cut off: in its map, and at the robot's pose if odometry continues."""
         try:
-            return self._load(self.earlier(""), resumes=True)
+            return self._load(self.earlier(""), resumption=self._resumption)
         except GraphSlamError:
             self._resumption = None
             if not self.config.output.load_at_start:
                 raise
             return self.load(self.config.output.load)
 
-    def _load(self, run: Path, T_map_base: Numbers | None = None, *, resumes: bool = False) -> str:
-        self.loads = run.name
-        try:
-            return self._go_on_from(run, T_map_base, resumes=resumes)
-        finally:
-            self.loads = ""
-
-    def _go_on_from(self, run: Path, T_map_base: Numbers | None, *, resumes: bool) -> str:
-        loaded = run_config(run)
+    def _load(self, run: Path, T_map_base: Numbers | None = None, resumption: Resumption | None = None) -> str:
+        loaded, losses = run_config(run), list[str]()
         if loaded.world != self.config.world:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
-        if run == self._folder:
-            self.finish()
-        losses, resumption = list[str](), self._resumption if resumes else None
-        start = map_of(run, losses)
-        self.finish()
-        self.config = self.slam.view.config
+        self.loads = run.name
         try:
-            self._begin(start, run)
-        except Exception:
-            self._begin(loaded=run)
-            raise
-        self._resumption = resumption
-        where = [] if T_map_base is None else [self._place(T_map_base)]
-        self._recorded(RunRecorder.flush)
-        self.estimate = self._estimated(Update(), 0.0)
+            if run == self._folder:
+                self.finish()
+            start = map_of(run, losses)
+            self.finish()
+            self.config = self.slam.view.config
+            try:
+                self._begin(start, run)
+            except Exception:
+                self._begin(loaded=run)
+                raise
+            self._resumption = resumption
+            where = [] if T_map_base is None else [self._place(T_map_base)]
+            self._recorded(RunRecorder.flush)
+            self.estimate = self._estimated(Update(), 0.0)
+        finally:
+            self.loads = ""
         return ": ".join([run.name, f"{len(self.slam.view.keyframes)} keyframes", *where, *losses[:1]])
 
     def _place(self, T_map_base: Numbers) -> str:
@@ -406,16 +374,15 @@ class Session:
             for event in END if not self._is_saved else ():
                 recorder.accept(event)
                 self._process(event)
-            folder = self._write(ended=True)
+            folder = str(self._write(ended=True))
         recorder.close()
         return folder
 
     def leave(self) -> tuple[int, int]:
-        """End the recording while measurements are in the queue.
+        """End the recording while measurements are in the queue, and perhaps the worker at one, whose results are lost.
 
         Returns their number: those in the journal, whose results the next start or ``graph_slam recover`` makes, and
-        those of a run that has not begun, which are lost. It may be called while the worker is busy; what the worker
-        still does is neither recorded nor published.
+        those of a run that has not begun, which are lost.
         """
         self._is_left = True
         recorder = self._recorder
@@ -437,12 +404,11 @@ class Session:
     def abandon(self) -> None:
         """End the recording as it is, if it was not finished."""
         self._is_left = True
-        if self._recorder is None:
-            return
-        try:
-            self._recorder.close()
-        except OSError:  # reported when it was to be saved
-            self._recorder.abandon()
+        if self._recorder is not None:
+            try:
+                self._recorder.close()
+            except OSError:  # reported when it was to be saved
+                self._recorder.abandon()
 
 
 _MOST_UNWRITTEN = 256 * 2**20  # bytes of the journal: hours of a robot's measurements

@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,27 +12,30 @@ try:
     from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, is_correction
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.node.diagnostics import InputFacts, Recent
-from graph_slam_ros.node.ingest import Ingest
-from graph_slam_ros.node.qos import InputQos, InputTopic, input_topics
-from graph_slam_ros.slam import Config, Counters
+from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.frontend.ingest_gate import input_of
 
 if TYPE_CHECKING:
     from graph_slam_ros.node.node import GraphSlamNode
+    from graph_slam_ros.node.runtime import Runtime
     from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
 
 _NUMBER = "publication_sequence_number"
 _UNSUPPORTED = 2**63
 _ASK_AGAIN_NS = 1_000_000_000
+_MOST = 3  # topics that are named
+_LANDMARKS = frozenset({"vision_msgs/msg/Detection3DArray", *LANDMARK_TYPES})
 
 
 class Losses:
@@ -54,13 +56,7 @@ class Losses:
         self._ask_at_ns = 0
 
     def before(self, info: Mapping[str, Any], now_ns: int) -> int:
-        """Return how many messages were lost between the last message and this one.
-
-        Parameters
-        ----------
-        info : what rclpy says of a message beside its content
-        now_ns : the time; while a topic has several publishers, they are asked for once a second
-        """
+        """Return how many messages were lost between the last message and this one, of which rclpy says ``info``."""
         number = info.get(_NUMBER)
         if number is None or number >= _UNSUPPORTED:
             return 0
@@ -74,44 +70,88 @@ class Losses:
         return 0 if expected is None or self._known != before else number - expected
 
 
-_MOST = 3  # that are named
-_LANDMARKS = frozenset({"vision_msgs/msg/Detection3DArray", *LANDMARK_TYPES})
-
-
 def alternatives(node: "GraphSlamNode", one: InputConfig, use: str, subscribed: Collection[str]) -> tuple[str, ...]:
-    """Return a text for each topic of another node that the input could use, with the parameters that choose it.
-
-    Parameters
-    ----------
-    use : of the input
-    subscribed : the topics of all inputs
-    """
-    if one.type == TRANSFORMS:
-        return ()
+    """Return a text for each topic of another node that the input could use, with the parameters that choose it."""
+    own = node.get_name(), node.get_namespace()
     found = [
         (kind != one.type, topic, kind)
-        for topic, kinds in node.get_topic_names_and_types()
+        for topic, kinds in (node.get_topic_names_and_types() if one.type != TRANSFORMS else ())
         for kind in kinds
         if kind == one.type or (use == "landmarks" and {kind, one.type} <= _LANDMARKS)
-        if topic not in subscribed and any(_others(node, topic))
+        if topic not in subscribed
+        if any((of.node_name, of.node_namespace) != own for of in node.get_publishers_info_by_topic(topic))
     ]
-    return tuple(_text(one.name, topic, kind, is_other_type=differs) for differs, topic, kind in sorted(found)[:_MOST])
+    return tuple(
+        f"{topic} has landmarks, too: {one.name}.type:={kind} {one.name}.topic:={topic}"
+        if is_other_type
+        else f"{topic} has this type: {one.name}.topic:={topic}"
+        for is_other_type, topic, kind in sorted(found)[:_MOST]
+    )
 
 
-def _text(name: str, topic: str, kind: str, *, is_other_type: bool) -> str:
-    if is_other_type:
-        return f"{topic} has landmarks, too: {name}.type:={kind} {name}.topic:={topic}"
-    return f"{topic} has this type: {name}.topic:={topic}"
+@dataclass(frozen=True, slots=True)
+class InputTopic:
+    """A topic to subscribe to, with its inputs. Of its QoS it has the parameter that asks for more than the least."""
+
+    type: str
+    name: str
+    inputs: Sequence[str]
+    depth: int
+    reliability: str = ""
+    durability: str = ""
+
+    @property
+    def qos(self) -> QoSProfile:
+        """The profile for rclpy."""
+        return QoSProfile(
+            depth=self.depth,
+            reliability=ReliabilityPolicy.RELIABLE if self.reliability else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if self.durability else DurabilityPolicy.VOLATILE,
+        )
+
+    def mismatch(self, publisher: Any) -> str:
+        """Return why a publisher does not connect, by its endpoint info; empty if it does."""
+        offers, name = publisher.qos_profile, publisher.node_name
+        if publisher.topic_type != self.type:
+            return f"{name} publishes {publisher.topic_type}, not {self.type}"
+        if self.reliability and offers.reliability == ReliabilityPolicy.BEST_EFFORT:
+            return f"{name} offers best effort, {self.reliability} asks for reliable delivery (QoS)"
+        if self.durability and offers.durability == DurabilityPolicy.VOLATILE:
+            return f"{name} offers volatile, {self.durability} asks for transient_local (QoS)"
+        return ""
 
 
-def _others(node: "GraphSlamNode", topic: str) -> Iterator[bool]:
-    """Yield for each publisher of a topic whether it belongs to another node."""
-    own = node.get_name(), node.get_namespace()
-    for publisher in node.get_publishers_info_by_topic(topic):
-        yield (publisher.node_name, publisher.node_namespace) != own
+def input_topics(node: "GraphSlamNode", config: Config) -> list[InputTopic]:
+    """The topics of the inputs, /tf and /tf_static. Raises ConfigError as ``input_topic`` does."""
+    topics: dict[tuple[str, str], list[str]] = {(TRANSFORMS, "/tf"): [TF]} if config.inputs.tf else {}
+    used = uses(config)
+    for one in config.sources:
+        if one.name in used:
+            topics.setdefault((one.type, node.resolve_topic_name(one.topic)), []).append(one.name)
+    static = InputTopic(TRANSFORMS, "/tf_static", [TF_STATIC], 100, "/tf_static", "/tf_static")
+    return [static, *(input_topic(config, *of, names) for of, names in topics.items())]
 
 
-_STATIC = InputQos(100, "/tf_static", "/tf_static")
+def input_topic(config: Config, kind: str, topic: str, names: Sequence[str]) -> InputTopic:
+    """The topic that these inputs share.
+
+    Raises
+    ------
+    ConfigError
+        Two of them ask for different reliability or durability: there is one subscription.
+    """
+    inputs = [one for one in config.sources if one.name in names]
+    asked: dict[str, str] = {}  # by what is asked for, the parameter that does so
+    for key, default in (("reliability", "auto"), ("durability", "")):
+        given = {getattr(one, key): f"{one.name}.{key}" for one in inputs if getattr(one, key) != default}
+        if len(given) > 1:
+            pairs = " and ".join(f"{parameter} ({value})" for value, parameter in given.items())
+            raise ConfigError(f"{pairs} are of one subscription, to {topic}: they must be the same")
+        asked |= given
+    if config.inputs.reliable and "best_effort" not in asked:
+        asked.setdefault("reliable", "inputs.reliable")
+    asks = asked.get("reliable", ""), asked.get("transient_local", "")
+    return InputTopic(kind, topic, names, config.inputs.depth, *asks)
 
 
 def event_is_safe() -> bool:
@@ -132,65 +172,61 @@ def full_name(endpoint: Any) -> str:
 
 
 @dataclass(slots=True)
-class _Received:
-    """The messages that came on one topic."""
+class _Input:
+    """What came for an input."""
 
-    received: int = 0
+    config: InputConfig
+    use: str
+    topic: InputTopic
+    received: int = 0  # messages of its topic
+    measured: int = 0
     seen: int = 0  # of these, at the last tick
     at_ns: int | None = None  # the tick at which there was something new
+    late_ns: float = math.inf  # the least since the last facts
+
+    def note(self, given: Sequence[Measured], now_ns: int) -> None:
+        """Note what a message has measured, and how late the newest of it is."""
+        self.measured += len(given)
+        newest_ns = max((m.stamp_ns for m in given if input_of(m) == self.config.name), default=0)
+        if newest_ns and now_ns:
+            self.late_ns = min(self.late_ns, now_ns - newest_ns)
+
+    def tick(self, now_ns: int) -> None:
+        """Note whether there is something new. On /tf, which has all transforms, that is odometry itself."""
+        is_on_tf = self.use == "odometry" and self.config.type == TRANSFORMS
+        count = self.measured if is_on_tf else self.received
+        if count != self.seen or (self.received and self.at_ns is None):
+            self.seen, self.at_ns = count, now_ns
 
 
 class Subscriptions:
-    """Subscriptions of the inputs and of /tf.
+    """Subscriptions of the inputs and of /tf: each message is converted, and its measurements go to ``Ingest``."""
 
-    Parameters
-    ----------
-    ingest : converts each message, and gets its measurements, which may be none
-    broadcaster : gets each transform from map
-    counters : count the messages that the middleware has lost
-    """
-
-    def __init__(
-        self,
-        node: "GraphSlamNode",
-        config: Config,
-        ingest: Ingest,
-        broadcaster: "TfBroadcaster",
-        counters: Counters,
-    ) -> None:
-        self._node, self._config, self._ingest = node, config, ingest
-        self._broadcaster, self._counters = broadcaster, counters
+    def __init__(self, run: "Runtime", broadcaster: "TfBroadcaster") -> None:
+        self._run, self._node, self._broadcaster = run, run.node, broadcaster
         self._subscriptions: list[Any] = []
-        self._topics: dict[str, _Received] = {}
-        self._of_input: dict[str, InputTopic] = {}
-        self._late_ns: dict[str, int] = {}  # the least since the last facts
-        self._on_tf: dict[str, _Received] = {}  # odometry there
-        self._converted: Counter[str] = Counter()
-        used = uses(config)
-        for topic in (InputTopic(TRANSFORMS, "/tf_static", [TF_STATIC], _STATIC), *input_topics(node, config)):
+        config = self._node.config
+        topics, used = input_topics(self._node, config), uses(config)
+        of = {name: topic for topic in topics for name in topic.inputs}
+        self._inputs = {
+            one.name: _Input(one, used[one.name], of[one.name]) for one in config.sources if one.name in used
+        }
+        for topic in topics:
             self._subscribe(topic)
-            for name in topic.inputs:
-                if name in used:
-                    self._of_input[name] = topic
-                    if topic.type_name == TRANSFORMS and used[name] == "odometry":
-                        self._on_tf[name] = _Received()
 
     def close(self) -> None:
         """Unsubscribe from all topics."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._topics.clear()
 
     def _subscribe(self, topic: InputTopic) -> None:
         """Convert every message of a topic for each of its inputs, one input after another."""
-        ingest, map_frame, names, is_tf = self._ingest, self._config.frames.map, topic.inputs, TF in topic.inputs
-        counted = self._topics[topic.name] = _Received()
+        node, ingest, map_frame = self._node, self._run.ingest, self._node.config.frames.map
         losses = None if event_is_safe() else Losses(lambda: self._publisher_ids(topic.name))
 
         def count_lost(times: int) -> None:
-            if times:
-                for name in names:
-                    self._counters.count(name, "lost_in_transport", times)
+            for name in topic.inputs if times else ():
+                self._run.counters.count(name, "lost_in_transport", times)
 
         def on_lost(event: Any) -> None:
             count_lost(event.total_count_change)  # 0 at some: rclpy reports them twice
@@ -198,55 +234,36 @@ class Subscriptions:
         def on_message(cdr: bytes, info: Mapping[str, Any]) -> None:
             if losses is not None:
                 count_lost(losses.before(info, time.monotonic_ns()))
-            if is_tf and is_correction(cdr, map_frame):
+            if TF in topic.inputs and is_correction(cdr, map_frame):
                 self._broadcaster.on_correction(cdr)
                 return
-            counted.received += 1
-            measured: list[Measured] = []
-            for name in names:
+            now_ns, measured = node.now_ns, list[Measured]()
+            for name in topic.inputs:
+                if name in self._inputs:
+                    self._inputs[name].received += 1
                 given = ingest.converter.convert(name, cdr)
-                self._converted[name] += len(given)
-                self._note_late(name, given)
+                if name in self._inputs:
+                    self._inputs[name].note(given, now_ns)
                 measured += given
             ingest.receive(measured, cdr)
-            ingest.check.add(topic.name, names, self._node.now_ns, measured, ingest.converter.decoded)
+            ingest.check.add(topic.name, topic.inputs, now_ns, measured, ingest.converter.decoded)
 
-        guarded = self._node.guarded
-        self._subscriptions.append(self._created(topic, _with_info(guarded(on_message), on_message), guarded(on_lost)))
-
-    def _note_late(self, name: str, given: Sequence[Measured]) -> None:
-        """Note how late the newest measurement of a message is, by the node's clock."""
-        stamps_ns = [m.stamp_ns for m in given if input_of(m) == name]
-        if stamps_ns and (now_ns := self._node.now_ns):
-            late_ns = now_ns - max(stamps_ns)
-            self._late_ns[name] = min(late_ns, self._late_ns.get(name, late_ns))
-
-    def _created(self, topic: InputTopic, on_message: Callable[..., None], on_lost: Callable[..., None]) -> Any:
-        """A subscription, with the event of lost messages if the middleware has one that can be used."""
-        create = partial(self._node.create_subscription, message_class(topic.type_name), topic.name, on_message)
-        if event_is_safe():
-            with suppress(UnsupportedEventTypeError):
-                events = SubscriptionEventCallbacks(message_lost=on_lost)
-                return create(topic.qos.profile, raw=True, event_callbacks=events)
-        return create(topic.qos.profile, raw=True)
+        callback = _with_info(node.guarded(on_message), on_message)
+        of = message_class(topic.type), topic.name, callback, topic.qos
+        create = partial(node.create_subscription, *of, raw=True)
+        events = SubscriptionEventCallbacks(message_lost=node.guarded(on_lost)) if event_is_safe() else None
+        with suppress(UnsupportedEventTypeError):
+            self._subscriptions.append(create(event_callbacks=events))
+            return
+        self._subscriptions.append(create())
 
     def _publisher_ids(self, topic: str) -> frozenset[bytes]:
         return frozenset(bytes(one.endpoint_gid) for one in self._node.get_publishers_info_by_topic(topic))
 
-    # -- facts -------------------------------------------------------------------------------------------------------
-
     def tick(self, now_ns: int) -> None:
-        """Note which topics have new data. It uses the node's clock, so that a pause makes no input silent.
-
-        Odometry on /tf has new data when a message contained odometry, because /tf carries all transforms.
-        """
-        for name, found in self._on_tf.items():
-            topic = self._topics[self._of_input[name].name]
-            if (topic.received and found.at_ns is None) or self._converted[name] != found.seen:
-                found.seen, found.at_ns = self._converted[name], now_ns
-        for counted in self._topics.values():
-            if counted.received != counted.seen:
-                counted.seen, counted.at_ns = counted.received, now_ns
+        """Note which inputs have new data. It uses the node's clock, so that a pause makes no input silent."""
+        for one in self._inputs.values():
+            one.tick(now_ns)
 
     def facts(
         self,
@@ -254,50 +271,37 @@ class Subscriptions:
         counted: Mapping[str, Mapping[str, int]],
         recent: Mapping[str, Recent],
         used: Mapping[str, int],
-    ) -> tuple[InputFacts, ...]:
-        """The facts of each input, with its counters since the start and in the last seconds.
+    ) -> Iterator[InputFacts]:
+        """Yield the facts of each input.
 
         Parameters
         ----------
+        counted, recent : what was counted since the start by input and reason, and in the last seconds
         used : by source, the measurements that the pipeline has used
         """
-        use_of = uses(self._config)
-        out = []
-        for one in self._config.sources:
-            if one.name not in self._of_input:
-                continue
-            topic = self._of_input[one.name]
-            on_topic = self._topics[topic.name]
-            self.tick(now_ns)
-            at_ns = self._on_tf.get(one.name, on_topic).at_ns
-            silent_s = math.inf if at_ns is None else max(0.0, (now_ns - at_ns) * 1e-9)
-            publishers = self._node.get_publishers_info_by_topic(topic.name)
+        self.tick(now_ns)
+        converter, subscribed = self._run.ingest.converter, {one.topic.name for one in self._inputs.values()}
+        for name, one in self._inputs.items():
+            publishers = self._node.get_publishers_info_by_topic(one.topic.name)
             names = tuple(sorted(set(map(full_name, publishers))))
-            out.append(
-                InputFacts(
-                    one.name,
-                    topic.name,
-                    use_of[one.name],
-                    on_topic.received,
-                    sum(times for source, times in used.items() if source.partition("#")[0] == one.name),
-                    counted.get(one.name, {}),
-                    silent_s,
-                    names,
-                    use_of[one.name] == "odometry" and one.type != TRANSFORMS and len(names) > 1,
-                    self._mismatches(topic),
-                    self._ingest.converter.unlinked(one.name),
-                    recent.get(one.name, Recent()),
-                    self._ingest.converter.not_found(one.name),
-                    () if names else alternatives(self._node, one, use_of[one.name], self._topics),
-                    self._late_ns.pop(one.name, math.nan) * 1e-9,
-                )
+            yield InputFacts(
+                name,
+                one.topic.name,
+                one.use,
+                one.received,
+                sum(times for source, times in used.items() if source.partition("#")[0] == name),
+                counted.get(name, {}),
+                math.inf if one.at_ns is None else max(0.0, (now_ns - one.at_ns) * 1e-9),
+                names,
+                one.use == "odometry" and one.config.type != TRANSFORMS and len(names) > 1,
+                "; ".join(filter(None, map(one.topic.mismatch, publishers))),
+                converter.unlinked(name),
+                recent.get(name, Recent()),
+                converter.not_found(name),
+                () if names else alternatives(self._node, one.config, one.use, subscribed),
+                one.late_ns * 1e-9,
             )
-        return tuple(out)
-
-    def _mismatches(self, topic: InputTopic) -> str:
-        """The reasons why publishers of a topic do not connect to its subscription; empty if all connect."""
-        publishers = self._node.get_publishers_info_by_topic(topic.name)
-        return "; ".join(filter(None, (_mismatch(publisher, topic) for publisher in publishers)))
+            one.late_ns = math.inf
 
 
 def _with_info(call: Callable[..., None], on_message: Callable[..., None]) -> Callable[..., None]:
@@ -312,9 +316,3 @@ def _with_info(call: Callable[..., None], on_message: Callable[..., None]) -> Ca
         call(*(given if len(given) == 2 else given[0]))
 
     return received
-
-
-def _mismatch(publisher: Any, topic: InputTopic) -> str:
-    if publisher.topic_type != topic.type_name:
-        return f"{publisher.node_name} publishes {publisher.topic_type}, not {topic.type_name}"
-    return topic.qos.mismatch(publisher)

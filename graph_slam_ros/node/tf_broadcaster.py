@@ -14,13 +14,14 @@ from graph_slam_ros.config.node import TfConfig
 from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.messages import to_msg
-from graph_slam_ros.node.ingest import Ingest
-from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import full_name
 from graph_slam_ros.typing import Numbers
 
 if TYPE_CHECKING:
     from graph_slam_ros.node.node import GraphSlamNode
+    from graph_slam_ros.node.runtime import Runtime
+
+_BEHIND_S = 1.0  # more is said
 
 
 class MapToOdom:
@@ -46,14 +47,7 @@ class MapToOdom:
     def next(
         self, config: TfConfig, now_ns: int, odometry_ns: int, T_odom_base: Numbers, T_map_odom: Numbers
     ) -> tuple[int, Numbers] | None:
-        """Stamp and transform to broadcast now; None if nothing is new.
-
-        Parameters
-        ----------
-        now_ns : by the clock of the node
-        odometry_ns, T_odom_base : the newest odometry
-        T_map_odom : as it is estimated
-        """
+        """Stamp and transform to broadcast with the newest odometry and the estimate; None if nothing is new."""
         if self._newest_ns is not None and odometry_ns <= self._newest_ns:
             return None
         stamp_ns = odometry_ns if config.stamp == "odometry" else now_ns
@@ -84,9 +78,11 @@ class MapToOdom:
         return tuple(map(float, group.compose(group.interpolate(here, there, part), group.inverse(T_odom_base))))
 
 
-_TOPIC = "/tf_static"
+_STATIC = "/tf_static"
 _PATIENCE_S = 2.0  # for what is latched to come again
 _QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_REMEMBERED = 500  # messages of ours that may still come back to us
+_OTHERS_S = 5.0  # after its last message somebody else is gone
 
 
 class StaticRival:
@@ -95,8 +91,8 @@ class StaticRival:
     Such a message comes once and stays valid. When a publisher of the topic has gone, all others are asked again.
     """
 
-    def __init__(self, node: "GraphSlamNode", odom_frame: str) -> None:
-        self._node, self._frame = node, odom_frame
+    def __init__(self, node: "GraphSlamNode") -> None:
+        self._node, self._frame = node, node.config.frames.odom
         self._until_s, self._parent = -math.inf, ""
         self._publishers: set[bytes] = set()
         self._subscribe()
@@ -112,18 +108,17 @@ class StaticRival:
 
     def refresh(self) -> None:
         """Ask again where a publisher has gone that may have published it. Call it about every second."""
-        if not self.transform:
-            return
-        publishers = {bytes(one.endpoint_gid) for one in self._node.get_publishers_info_by_topic(_TOPIC)}
-        if self._publishers - publishers:
-            self._until_s = min(self._until_s, time.monotonic() + _PATIENCE_S)
-            self.close()
-            self._subscribe()
-        self._publishers = publishers
+        if self.transform:
+            publishers = {bytes(one.endpoint_gid) for one in self._node.get_publishers_info_by_topic(_STATIC)}
+            if self._publishers - publishers:
+                self._until_s = min(self._until_s, time.monotonic() + _PATIENCE_S)
+                self.close()
+                self._subscribe()
+            self._publishers = publishers
 
     def _subscribe(self) -> None:
         on_message = self._node.guarded(self._on_message)
-        self._subscription = self._node.create_subscription(TFMessage, _TOPIC, on_message, _QOS)
+        self._subscription = self._node.create_subscription(TFMessage, _STATIC, on_message, _QOS)
 
     def _on_message(self, message: Any) -> None:
         for one in message.transforms:
@@ -131,43 +126,26 @@ class StaticRival:
                 self._until_s, self._parent = math.inf, one.header.frame_id.lstrip("/")
 
 
-_REMEMBERED = 500  # messages of ours that may still come back to us
-_OTHERS_S = 5.0  # after its last message somebody else is gone
-
-
 class TfBroadcaster:
-    """The publisher of map -> odom while the node is active.
+    """The publisher of map -> odom while the node is active."""
 
-    Parameters
-    ----------
-    session, ingest : have the last estimate, and the newest odometry
-
-    Attributes
-    ----------
-    static : the search for another broadcaster on /tf_static
-    """
-
-    def __init__(
-        self,
-        node: "GraphSlamNode",
-        session: Session,
-        ingest: Ingest,
-    ) -> None:
-        self._node, self._session, self._ingest, config = node, session, ingest, node.config
-        self._policy = MapToOdom(config)
-        self._publisher = node.create_publisher(TFMessage, "/tf", 100)
+    def __init__(self, run: "Runtime") -> None:
+        self._run, self._node = run, run.node
+        self._policy = MapToOdom(self._node.config)
+        self._publisher = self._node.create_publisher(TFMessage, "/tf", 100)
         self._is_closed = False
         self._ours: deque[bytes] = deque(maxlen=_REMEMBERED)
-        self._others_s = -1e9
-        self.static = StaticRival(node, config.frames.odom)
-        self._timer = node.create_timer(config.tf.transform_publish_period, node.guarded(self._tick))
+        self._others_s = -math.inf
+        self._static = StaticRival(self._node)
+        period_s = self._node.config.tf.transform_publish_period
+        self._timer = self._node.create_timer(period_s, self._node.guarded(self._tick))
 
     def close(self) -> None:
         """Remove timer and publisher. A tick that is already on its way finds them removed."""
         self._is_closed = True
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
-        self.static.close()
+        self._static.close()
 
     def forget_time(self) -> None:
         """Begin anew with the stamps."""
@@ -178,18 +156,15 @@ class TfBroadcaster:
         if cdr[4:] not in self._ours:
             self._others_s = time.monotonic()
 
-    @property
-    def behind_s(self) -> float:
-        """The time by which the next transform would be dated before the last one; until it is 0, none is sent."""
-        return self._policy.behind_s
-
-    def rivals(self) -> Iterator[Finding]:
-        """Yield that another node broadcasts the transform, or gives odometry's frame another parent."""
-        self.static.refresh()
-        if transform := self.static.transform:
-            yield Finding("static_rival", "error", topic=transform, text=self._others_on(_TOPIC))
+    def wrong(self) -> Iterator[Finding]:
+        """Yield that another node sends the transform or gives odometry's frame another parent, or none is sent."""
+        self._static.refresh()
+        if transform := self._static.transform:
+            yield Finding("static_rival", "error", topic=transform, text=self._others_on(_STATIC))
         elif time.monotonic() - self._others_s < _OTHERS_S:
             yield Finding("rival", "error", text=self._others_on("/tf"))
+        if self._policy.behind_s > _BEHIND_S:
+            yield Finding("behind_last", "warning", self._policy.behind_s)
 
     def _others_on(self, topic: str) -> str:
         """The other nodes that publish on a topic, one of which it is: a transform does not say who sent it."""
@@ -198,18 +173,16 @@ class TfBroadcaster:
         return f"one of {', '.join(others)}, which publish {topic}" if len(others) > 1 else "".join(others) or "a node"
 
     def _tick(self) -> None:
-        config, odometry = self._node.config, self._ingest.extrapolator
+        config, odometry = self._node.config, self._run.ingest.extrapolator
         newest = odometry.newest
         if self._is_closed or newest is None or not config.tf.publish_tf:
             return
-        estimated = self._session.T_map_odom(newest, odometry.source)
+        estimated = self._run.session.T_map_odom(newest, odometry.source)
         if estimated is None:
             return
-        now_ns = self._node.get_clock().now().nanoseconds
-        due = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimated)
-        if due is None:
-            return
-        stamp_ns, T_map_odom = due
-        cdr = to_msg.transform(stamp_ns, config.frames.map, config.frames.odom, T_map_odom)
-        self._ours.append(cdr[4:])
-        self._publisher.publish(cdr)
+        due = self._policy.next(config.tf, self._node.now_ns, newest.stamp_ns, newest.T_odom_base, estimated)
+        if due is not None:
+            stamp_ns, T_map_odom = due
+            cdr = to_msg.transform(stamp_ns, config.frames.map, config.frames.odom, T_map_odom)
+            self._ours.append(cdr[4:])
+            self._publisher.publish(cdr)

@@ -19,13 +19,10 @@ _POLL_S = 0.05
 
 
 class Worker:
-    """A thread with a queue of jobs.
+    """A thread with a queue of jobs: up to ``most`` are offered, those that are called always have room.
 
-    Parameters
-    ----------
-    most : queued jobs up to which ``offer`` accepts another; ``call`` always does
-    on_fault : called in the thread with what an offered job has raised; the next job follows
-    on_exit : called in the thread after a job that would have ended it, as ``SystemExit`` does; the next job follows
+    ``on_fault`` is called in the thread with what an offered job has raised, ``on_exit`` after a job that would have
+    ended it, as ``SystemExit`` does. The next job follows.
     """
 
     def __init__(
@@ -33,8 +30,7 @@ class Worker:
     ) -> None:
         self._most, self._on_fault, self._on_exit = most, on_fault, on_exit
         self._jobs: queue.SimpleQueue[tuple[Sequence[Job], Future[Any] | None, float] | None] = queue.SimpleQueue()
-        self._since: float | None = None
-        self._begun: float | None = None
+        self._since = self._begun = math.inf  # when the present job was queued, and when it started
         self._is_left = False
         self._thread = threading.Thread(target=self._run, name="graph_slam_worker", daemon=True)
         self._thread.start()
@@ -60,14 +56,12 @@ class Worker:
     @property
     def lag_s(self) -> float:
         """The time since the present job was queued."""
-        since = self._since
-        return 0.0 if since is None else time.monotonic() - since
+        return max(0.0, time.monotonic() - self._since)
 
     @property
     def busy_s(self) -> float:
         """The time since the present job started."""
-        begun = self._begun
-        return 0.0 if begun is None else time.monotonic() - begun
+        return max(0.0, time.monotonic() - self._begun)
 
     @property
     def is_alive(self) -> bool:
@@ -86,10 +80,7 @@ class Worker:
     def stop(self, timeout_s: float | None = None, is_urgent: Callable[[], bool] = lambda: False) -> bool:
         """Do the queued jobs, then end. False if that takes too long; then no further job is started.
 
-        Parameters
-        ----------
-        timeout_s : None: as long as it takes
-        is_urgent : called meanwhile; once it is true, the rest may take ``URGENT_S``
+        Without a timeout it may take as long as it takes, and ``URGENT_S`` once ``is_urgent``.
         """
         self._jobs.put(None)
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
@@ -106,7 +97,7 @@ class Worker:
             self._begun = time.monotonic()
             for job in jobs:
                 self._do(job, future)
-            self._since = self._begun = None
+            self._since = self._begun = math.inf
 
     def _do(self, job: Job, future: "Future[Any] | None") -> None:
         error = _failure(job, future)

@@ -136,7 +136,7 @@ def test_without_a_node_or_where_its_own_does_not_start_the_player_says_so(bag, 
     monkeypatch.setattr(player, "_PATIENCE_S", 0.5)
     monkeypatch.setattr(os, "environ", dict(ENVIRONMENT))
     assert main(["replay", str(bag), "--ros", "--node", "/nobody"]) == 2
-    assert capsys.readouterr().err == "graph_slam: no parameters of /nobody: is the node running?\n"
+    assert capsys.readouterr().err == "graph_slam: no /nobody/list_parameters: is the node running?\n"
 
 
 def test_what_is_refused_at_the_start_ends_the_node_with_its_reason_and_code_2(tmp_path):

@@ -154,16 +154,16 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
     for name, path in FILES.items():
         if name.startswith("node/"):
             for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.Call) and ast.unparse(node.func).endswith((".get_logger().info", "._log.info")):
+                if isinstance(node, ast.Call) and ast.unparse(node.func).endswith((".get_logger().info", "log.info")):
                     told.append(ast.unparse(node.args[0]))
     assert sorted(told) == [
         "'bond with the lifecycle manager'",
         "'compiling kernels, once per installation: about a minute'",
         "f'kernels ready after {elapsed_s:.1f} s'",
         "f'saved {Path(folder).name}'",
-        "line",
         "message",
         "str(error)",
+        "verdict.text",
     ]
 
 
