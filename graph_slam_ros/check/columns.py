@@ -21,7 +21,7 @@ from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.detections import names_of
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
-from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount, pose
+from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount
 from graph_slam_ros.typing import Array, Index, Mask
 
 MOST = 0.5  # part of all: more are most of them
@@ -386,8 +386,8 @@ class Collector:
         for t in message.transforms:
             parent, child = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
             if fixed:
-                r = t.transform.rotation
-                self._transforms.add(parent, child, pose(t.transform.translation, (r.x, r.y, r.z, r.w)))
+                v, r = t.transform.translation, t.transform.rotation
+                self._transforms.add(parent, child, (v.x, v.y, v.z, r.x, r.y, r.z, r.w))
             self._links[parent, child] = None
 
     def _T_base(self, one: _Input) -> se3.Pose | None:

@@ -23,7 +23,7 @@ from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryReader
 from graph_slam_ros.messages.inputs.plugins import PluginFault
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet, Origin
-from graph_slam_ros.messages.inputs.transforms import Transforms, pose
+from graph_slam_ros.messages.inputs.transforms import Transforms
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.one_publisher import OnePublisher
 
@@ -31,8 +31,6 @@ Decoder = Callable[[bytes], Any]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TF_STATIC, TF, INITIAL_POSE = "tf_static", "tf", "initialpose"
-_TF_BUFFER_NS = 10 * 10**9  # transforms of /tf are kept for so long, as tf2 does
-_POSE_NUMBERS = 7 + 36  # of a geometry_msgs/PoseWithCovariance
 
 
 @cache
@@ -52,21 +50,15 @@ def is_correction(cdr: bytes, map_frame: str) -> bool:
         return False
 
 
-def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
-    """The geometry_msgs/TwistWithCovariance, little endian, of a nav_msgs/Odometry, without decoding the rest.
+def twist_of(message: Any, base_frame: str) -> bytes | None:
+    """The geometry_msgs/TwistWithCovariance, little endian, of a nav_msgs/Odometry.
 
     None if its frame is not the base, because the motion of a wheel or a sensor is not that of the robot.
     """
-    reader = CdrReader(cdr)
-    try:
-        reader.stamp_ns()
-        reader.text()
-        child = reader.text().lstrip(b"/")
-        reader.numbers("d", _POSE_NUMBERS)
-        twist = reader.numbers("d", 42)
-    except struct.error:
+    if message.child_frame_id.lstrip("/") != base_frame:
         return None
-    return struct.pack("<42d", *twist) if child == base_frame.encode() else None
+    v, w = message.twist.twist.linear, message.twist.twist.angular
+    return struct.pack("<6d", v.x, v.y, v.z, w.x, w.y, w.z) + message.twist.covariance.astype("<f8").tobytes()
 
 
 @dataclass(slots=True)
@@ -104,7 +96,7 @@ class MessageConverter:
         self._config, self._counters, self._decoders = config, counters, dict(decoders or {})
         self.on_fault: Callable[[str], object] = lambda line: None
         self.decoded: Any = None
-        self._transforms = Transforms(_TF_BUFFER_NS, partial(counters.count, TF, "far_in_time"))
+        self._transforms = Transforms(refuse=partial(counters.count, TF, "far_in_time"))
         self._links, self._awaits_stamp = 0, False  # of the last try of what waits
         self._inputs: dict[str, _Input] = {}
         self._pending: deque[tuple[_Input, Any]] = deque()  # for /tf to tell where their sensors were
@@ -113,21 +105,21 @@ class MessageConverter:
         self._origin = Origin(next(filter(None, datums), ()))
         for name, use in uses(config).items():
             counters.received[name] += 0
-            type_name = by_name[name].type
-            self._add(by_name[name], type_name, use, (converters(type_name) or {})[use])
-        for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
-            self._add(InputConfig(name), TRANSFORMS, "none", partial(self._transforms_of, add))
-        given = InputConfig(INITIAL_POSE, sigma_m=config.initialpose.sigma_m, sigma_rad=config.initialpose.sigma_rad)
-        self._add(given, "geometry_msgs/msg/PoseWithCovarianceStamped", "none", fixes.initial_pose)
+            self._add(by_name[name], use, (converters(by_name[name].type) or {})[use])
+        for name in (TF_STATIC, TF):
+            self._add(InputConfig(name, type=TRANSFORMS), "none", self._add_transforms)
+        posed, person = "geometry_msgs/msg/PoseWithCovarianceStamped", config.initialpose
+        given = InputConfig(INITIAL_POSE, type=posed, sigma_m=person.sigma_m, sigma_rad=person.sigma_rad)
+        self._add(given, "none", fixes.initial_pose)
 
-    def _add(self, settings: InputConfig, type_name: str, use: str, convert: Callable[..., Any]) -> None:
+    def _add(self, settings: InputConfig, use: str, convert: Callable[..., Any]) -> None:
         name, source = settings.name, InputContext(settings, use, self._config, self._transforms, self._origin)
-        decode = self._decoders.get(type_name) or own_decoder(type_name)
+        decode = self._decoders.get(settings.type) or own_decoder(settings.type)
         one = self._inputs[name] = _Input(source, decode, convert)
         if use == "odometry":
             refuse = (partial(self._counters.count, name, reason) for reason in ("other_publisher", "future"))
             one.publisher = OnePublisher(self._config.odometry.timeout_s, *refuse)
-            if type_name == odometry.TYPE and decode is own_decoder(type_name):  # else its bytes may have other places
+            if decode is own_decoder(odometry.TYPE):  # else its bytes may have other places
                 one.reader = OdometryReader()
 
     def convert(self, name: str, cdr: bytes) -> list[Measured]:
@@ -144,15 +136,14 @@ class MessageConverter:
         if one.publisher is not None:
             accept = one.publisher.accept
             out = [m for given in out if isinstance(given, Odometry) for m in accept(given)]
-            for m in out:
-                if m.stamp_ns > (self._transforms.now_ns or 0):
-                    self._transforms.now_ns = m.stamp_ns
+            if out:
+                self._transforms.now_ns = max(self._transforms.now_ns or 0, *(m.stamp_ns for m in out))
         if (name == TF or one.publisher is not None) and self._may_be_usable():
             self._awaits_stamp = False
             for _ in range(len(self._pending)):
                 out += self._converted(*self._pending.popleft())
         elif len(self._pending) > self._config.ordering.max_waiting:
-            out += self._hurried(*self._pending.popleft())
+            out += self._converted(*self._pending.popleft(), is_hurried=True)
         return out
 
     def _may_be_usable(self) -> bool:
@@ -174,22 +165,22 @@ class MessageConverter:
         if one.reader is None or one.publisher is None or self._pending:
             return []
         read = one.reader.read_run(cdrs)
-        run = [] if read is None else odometry.of_run(one.source, read, after_ns)
-        count = one.publisher.accept_run(run)
-        if read is None or not count:
+        run, repairs = ([], []) if read is None else odometry.of_run(one.source, read, after_ns)
+        run = run[: one.publisher.accept_run(run)]
+        if read is None or not run:
             return []
-        odometry.count_repairs(one.source, count)
-        self._count_tally(one.source)
-        self._counters.received[name] += count
-        self._transforms.now_ns = max(run[count - 1].stamp_ns, self._transforms.now_ns or 0)
-        self.decoded = read.first(count)
-        return run[:count]
+        for repair in repairs:
+            self._counters.count(name, repair, len(run))
+        self._counters.received[name] += len(run)
+        self._transforms.now_ns = max(run[-1].stamp_ns, self._transforms.now_ns or 0)
+        self.decoded = read.first(len(run))
+        return run
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:
         """Use or refuse what still needs a transform; at the end of all messages also the odometry that is kept."""
         publishers = self._publishers() if is_end else ()
         out: list[Measured] = [m for one in publishers for m in one.finish()]
-        out += [one for pending in self._pending for one in self._hurried(*pending)]
+        out += [m for pending in self._pending for m in self._converted(*pending, is_hurried=True)]
         self._pending.clear()
         return out
 
@@ -221,16 +212,10 @@ class MessageConverter:
     def _publishers(self) -> list[OnePublisher]:
         return [one.publisher for one in self._inputs.values() if one.publisher is not None]
 
-    def _hurried(self, one: _Input, message: Any) -> list[Measured]:
-        before, one.source.hurried = one.source.hurried, True
-        out = self._converted(one, message)
-        one.source.hurried = before
-        return out
-
     @np.errstate(invalid="ignore")  # a signalling NaN warns where it is compared; it is refused by name
-    def _converted(self, one: _Input, message: Any) -> list[Any]:
-        out: list[Any] = []
-        source = one.source
+    def _converted(self, one: _Input, message: Any, *, is_hurried: bool = False) -> list[Any]:
+        out, source = list[Any](), one.source
+        source.is_hurried = is_hurried or not self._config.inputs.tf
         try:
             out += one.convert(source, message)
         except NotYet as why:
@@ -244,35 +229,22 @@ class MessageConverter:
                 self.on_fault(f"{source.name}: {fault}")
         except MessageError as reason:
             source.count(str(reason))
-        if source.tally:
-            self._count_tally(source)
+        for what, times in source.tally.items():
+            self._counters.count(source.name, what, times)
+        source.tally.clear()
         return out
 
-    def _count_tally(self, source: InputContext) -> None:
-        for why, times in source.tally.items():
-            self._counters.count(source.name, why, times)
-        source.tally.clear()
+    def _add_transforms(self, source: InputContext, message: Any) -> list[Measured]:
+        def add(t: Any) -> None:
+            T_parent_child = source.placed(t.transform.translation, t.transform.rotation)
+            parent, child = source.frame(t.header.frame_id), source.frame(t.child_frame_id)
+            if parent == child:
+                raise MessageError("frame_in_itself")
+            if source.name == TF_STATIC:
+                self._transforms.add(parent, child, T_parent_child)
+            elif parent != self._config.frames.map:  # that is what we estimate: nothing may be measured by it
+                self._transforms.add_at(checks.stamp_ns(t.header.stamp), parent, child, T_parent_child)
 
-    # -- transforms --------------------------------------------------------------------------------------------------
-
-    def _transforms_of(
-        self, add: Callable[[Any, str, str, Any], None], source: InputContext, message: Any
-    ) -> list[Measured]:
-        for t in message.transforms:
-            try:
-                checks.point(t.transform.translation)
-                q = source.unit(t.transform.rotation)
-                parent, child = source.frame(t.header.frame_id), source.frame(t.child_frame_id)
-                if parent == child:
-                    raise MessageError("frame_in_itself")
-                add(t, parent, child, pose(t.transform.translation, q))
-            except MessageError as reason:
-                source.count(str(reason))
+        for _ in source.each(message.transforms, add):
+            pass
         return []
-
-    def _add_static(self, t: Any, parent: str, child: str, T_parent_child: Any) -> None:
-        self._transforms.add(parent, child, T_parent_child)
-
-    def _add_moving(self, t: Any, parent: str, child: str, T_parent_child: Any) -> None:
-        if parent != self._config.frames.map:  # that is what we estimate: nothing may be measured by it
-            self._transforms.add_at(checks.stamp_ns(t.header.stamp), parent, child, T_parent_child)

@@ -33,14 +33,7 @@ INTERFACES: dict[str, dict[str, str]] = {
 
 @cache
 def typestore() -> Typestore:
-    """Return the one rosbags type store: the types of ROS 2 Jazzy and those of `INTERFACES`.
-
-    Returns
-    -------
-    Typestore
-        Shared by all callers; they may register further types, never change one.
-
-    """
+    """Return the one rosbags type store, of ROS 2 Jazzy and `INTERFACES`. Nobody may change a type in it."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)

@@ -12,8 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.colours import DARK, rgba
 from graph_slam_ros.formats.cdr import CdrWriter
+from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph.tables import EdgeRows
 from graph_slam_ros.lie import se3
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.slam import MapView
+from graph_slam_ros.typing import Array, Index, Numbers
 
 _ADD, _DELETE_ALL = 0, 3
 _ARROW, _SPHERE, _CYLINDER, _LINE_LIST, _POINTS, _TEXT = 0, 2, 3, 5, 8, 9
@@ -26,6 +30,7 @@ _OF_REJECTED = rgba(DARK["closures"], 0.8)
 # Green over yellow to red in even steps of hue in OKLCH and ever a little darker, for those to whom they are alike.
 _RAMP = np.array([[0.38, 0.90, 0.42], [0.69, 0.75, 0.03], [0.80, 0.60, 0.0], [0.85, 0.44, 0.0], [0.87, 0.23, 0.24]])
 _DASHES = 5
+_COORDINATES = {SE2: 2, SE3: 3, R2: 2, R3: 3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +78,101 @@ def landmark_markers(
         out.add("landmarks", k, _CYLINDER if flat else _SPHERE, at=pose, size=size)
         out.add("names", k, _TEXT, at=pose, size=(0.0, 0.0, 0.25), text=name)
     return out.message()
+
+
+def graph_view(view: MapView, most: int) -> GraphView:
+    """Draw at most so many keyframes, landmarks and edges of the graph at its estimate.
+
+    An edge is a line between its vertices. An edge of a position alone is a line from there to the point of the robot.
+    An edge without a position is not drawn.
+    """
+    graph, at = view.graph, _positions(view)
+    drawn = [table for table in graph.tables.values() if _is_drawn(view.space, table.type)]
+    ids = np.concatenate([table.ids for table in drawn] or [np.empty(0, dtype=np.int64)])
+    chi2, numbers = view.solver.chi2_of(ids)
+    misfit = np.zeros(graph.edge_ids.next)
+    misfit[ids] = chi2 / numbers
+    shown = np.zeros(graph.edge_ids.next, dtype=bool)
+    shown[_worst_and_some(ids, misfit[ids], most)] = True
+
+    parts = [(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64))]
+    for table in drawn:
+        some = table.at(np.flatnonzero(shown[table.ids]))
+        label = np.where(some.weight == 0.0, len(graph.labels), some.label)
+        parts.append((*_ends(view, at, table.type, some), misfit[some.ids], label))
+    start, end, fit, labels = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    which = {name: labels == code for code, name in enumerate((*graph.labels, ""))}
+    lines = {name: Lines(start[of], end[of], fit[of]) for name, of in which.items()}
+    keyframes = view.keyframes.ids[thinned(len(view.keyframes.ids), most)]
+    landmarks = np.array([mark.vertex for mark in view.landmarks.values()], dtype=np.int64)
+    landmarks = landmarks[thinned(len(landmarks), most)]
+    return GraphView(at[keyframes], at[landmarks], lines, rejected=lines.pop(""))
+
+
+def thinned(count: int, most: int) -> Index:
+    """Indices to show of ``count`` if at most ``most`` (two or more; 0: all) are allowed, with first and last.
+
+    It takes every second, every fourth, and so on. While the count grows the choice stays the same until it is too
+    large; then it is halved.
+    """
+    stride = 1
+    while most and -(-(count - 1) // stride) + 1 > max(most, 2):
+        stride *= 2
+    kept = np.arange(0, count, stride)
+    return kept if count == 0 or kept[-1] == count - 1 else np.append(kept, count - 1)
+
+
+def _worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
+    """Select ids of edges with a misfit (n,), no more than ``most``, in order of their ids (n,).
+
+    Half of them are the worst edges. The others are all edges whose id is divisible by a power of two.
+    """
+    if len(ids) <= most:
+        return ids
+    half = most // 2
+    order = np.argpartition(-misfit, half)
+    worst, others = ids[order[:half]], ids[order[half:]]
+    stride = 1
+    while len(others) > most - half:
+        stride *= 2
+        others = others[others % stride == 0]
+    return np.sort(np.concatenate((worst, others)))
+
+
+def _positions(view: MapView) -> Array:
+    """Positions of all vertices that have one, each at its id, (n, 3)."""
+    graph, out, every = view.graph, np.zeros((view.graph.vertex_ids.next, 3)), view.graph.vertex_ids.since()
+    for code, kind in enumerate(graph.kinds):
+        if n := _COORDINATES.get(kind, 0):
+            ids = every[graph.kind_codes(every) == code]
+            out[ids, :n] = view.solver.estimate(ids)[:, :n]
+    return out
+
+
+def _is_drawn(space: Geometry, kind: EdgeType) -> bool:
+    if len(kind.accepts) > 1:
+        return all(slot[0] in _COORDINATES for slot in kind.accepts[:2])
+    return kind in (space.pose_prior, POINT_PRIOR[space.point], space.fixes["position"], space.coordinate_prior)
+
+
+def _ends(view: MapView, at: Array, kind: EdgeType, some: EdgeRows) -> tuple[Array, Array]:
+    """The ends of the lines of some rows of a table that is drawn."""
+    space, n, end = view.space, view.space.dimensions, at[some.vertices[:, 0]]
+    if len(kind.accepts) > 1:
+        return end, at[some.vertices[:, 1]]
+    start = some.measured[:, :n]
+    if kind in (space.fixes["position"], space.coordinate_prior):  # they are of the antenna
+        poses, lever = view.solver.estimate(some.vertices[:, 0]).reshape(-1, space.pose.size), some.measured[:, -n:]
+        antenna = np.stack(space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)
+        end = _in_space(antenna)
+        if kind is space.coordinate_prior:  # from the nearest point with the measured coordinate
+            residual = np.einsum("ij,ij->i", start, antenna) - some.measured[:, n]
+            start = antenna - residual[:, None] * start
+    return _in_space(start), end
+
+
+def _in_space(points: Array) -> Array:
+    return np.concatenate((points, np.zeros((len(points), 3 - points.shape[1]))), axis=1)
 
 
 def graph_markers(stamp_ns: int, frame: str, view: GraphView) -> bytes:

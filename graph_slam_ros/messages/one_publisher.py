@@ -22,7 +22,6 @@ _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 10.0, 20.0  # of robots
 _START_M_S, _START_RAD_S = 3.0, 3.0  # speed of a track that has only one pose
 _LEAST_S, _MOST_S, _MOST_RATIO = 0.02, 1.0, 10.0  # stamps may crowd together; a track leads no farther than this
 _BACK_NS = 200_000_000  # what is older is left to the order of stamps
-_AHEAD_NS = 60_000_000_000  # where odometry goes on so much later, the tracks begin anew
 _GAP_NS, _GAP_PERIODS = 1_000_000_000, 10.0  # what is dated later than after so long a gap waits for the next to agree
 _SURE, _PERIODS, _PATIENT_NS = 3, 3.0, 500_000_000  # messages, periods and ns after which a new track is a jump
 _NOISY, _NOISIEST = 3.0, 2.5  # of the usual misfit, and at most
@@ -149,7 +148,9 @@ class OnePublisher:
     def forget_time(self) -> None:
         """Begin anew with the stamps, without tracks."""
         self._leap.forget()
-        self._begin_anew()
+        for track in self._tracks:
+            self._drop(track, 0)
+        self._tracks.clear()
 
     def _goes_on(self, m: Odometry) -> bool:
         """Return whether a message, now part of it, goes on with the only track: the quick answer for nearly all."""
@@ -172,8 +173,6 @@ class OnePublisher:
     def _follow_publisher(self, m: Odometry) -> list[Odometry]:
         if self._labels > _MOST_LABELS:
             return [m]  # these are no publishers: whatever it is, it is used as it comes
-        if self._tracks and m.stamp_ns > self._tracks[0].newest_ns + _AHEAD_NS:
-            self._begin_anew()
         if not self._tracks:
             self._tracks.append(_Track(m, m.source))
             return [m]
@@ -260,11 +259,6 @@ class OnePublisher:
         used.is_established, track.is_established = True, False
         self._tracks.insert(0, track)
         return _handed_on(track)
-
-    def _begin_anew(self) -> None:
-        for track in self._tracks:
-            self._drop(track, 0)
-        self._tracks.clear()
 
     def _drop(self, track: _Track, kept: int) -> None:
         """Use none of what waits, except perhaps the last few."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages import markers, to_msg
-from graph_slam_ros.messages.graph_markers import graph_view, thinned
+from graph_slam_ros.messages.markers import graph_view, thinned
 from graph_slam_ros.slam import MapView
 from graph_slam_ros.typing import Array, Numbers
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from graph_slam_ros.formats.cdr import HEADER, LATEST_NS, NS, CdrWriter, stamp
+from graph_slam_ros.formats.cdr import LATEST_NS, NS, CdrWriter
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.interfaces import typestore
@@ -59,11 +59,6 @@ def vector(x: float, y: float, z: float = 0.0) -> Any:
 def quaternion(x: float, y: float, z: float, w: float) -> Any:
     """geometry_msgs/Quaternion."""
     return make("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
-
-
-def heading(theta: float) -> Any:
-    """geometry_msgs/Quaternion of a rotation about z."""
-    return quaternion(0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta))
 
 
 def pose(p: ArrayLike) -> Any:
@@ -155,25 +150,14 @@ class Status:
 
 def diagnostics(stamp_ns: int, statuses: Iterable[Status]) -> bytes:
     """diagnostic_msgs/DiagnosticArray, without a frame."""
-    return encode(
-        make(
-            "diagnostic_msgs/msg/DiagnosticArray",
-            header=header(stamp_ns, ""),
-            status=[
-                make(
-                    "diagnostic_msgs/msg/DiagnosticStatus",
-                    level=one.level,
-                    name=one.name,
-                    message=one.message,
-                    hardware_id=one.hardware_id,
-                    values=[
-                        make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in one.values.items()
-                    ],
-                )
-                for one in statuses
-            ],
-        )
-    )
+    head, listed = header(stamp_ns, ""), [_status(one) for one in statuses]
+    return encode(make("diagnostic_msgs/msg/DiagnosticArray", header=head, status=listed))
+
+
+def _status(one: Status) -> Any:
+    kind, pair = "diagnostic_msgs/msg/DiagnosticStatus", "diagnostic_msgs/msg/KeyValue"
+    values = [make(pair, key=key, value=value) for key, value in one.values.items()]
+    return make(kind, level=one.level, name=one.name, message=one.message, hardware_id=one.hardware_id, values=values)
 
 
 def clock(stamp_ns: int) -> bytes:
@@ -186,36 +170,23 @@ def path(frame: str, stamps_ns: ArrayLike, poses: Array, newest_ns: int | None =
 
     All poses after the first take the same number of bytes. The first has its own padding.
     """
-    stamps = np.asarray(stamps_ns, dtype=np.int64)
-    name = frame.encode() + b"\x00"
+    stamps, name = np.asarray(stamps_ns, dtype=np.int64), frame.encode() + b"\x00"
     if newest_ns is None:
         newest_ns = int(stamps[-1]) if len(stamps) else 0
-    head = stamp(newest_ns) + np.uint32(len(name)).tobytes() + name
-    head += b"\x00" * (-len(head) % 4) + np.uint32(len(stamps)).tobytes()
-    if not len(stamps):
-        return HEADER + head
-    first, others = _pose_rows(name, stamps[:1], poses[:1], len(head)), _pose_rows(name, stamps[1:], poses[1:], 0)
-    return b"".join((HEADER, head, first.data, others.data))  # a megabyte, copied once
-
-
-def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> NDArray[np.uint8]:
-    """PoseStamped rows as bytes, aligned to 8 bytes plus ``start`` from the start of the message."""
-    text = 12 + len(name)
-    row = np.dtype(
-        [
-            ("sec", "<i4"),
-            ("nanosec", "<u4"),
-            ("length", "<u4"),
-            ("frame", f"S{len(name)}"),
-            ("padding", f"V{-(start + text) % 8}"),
-            ("values", "<f8", 7),
-        ]
-    )
-    rows = np.zeros(len(stamps), dtype=row)
-    rows["sec"], rows["nanosec"] = np.divmod(stamps, NS)
+    out = CdrWriter()
+    out.header(newest_ns, frame)
+    out.numbers("I", len(stamps))
+    for stamp_ns, pose in zip(stamps[:1], poses, strict=False):
+        out.header(int(stamp_ns), frame)
+        out.array(se3.in_space(pose))
+    numbers = [("sec", "<i4"), ("nanosec", "<u4"), ("length", "<u4")]
+    text = [("frame", f"S{len(name)}"), ("padding", f"V{-(12 + len(name)) % 8}")]
+    rows = np.zeros(max(0, len(stamps) - 1), dtype=[*numbers, *text, ("values", "<f8", 7)])
+    rows["sec"], rows["nanosec"] = np.divmod(stamps[1:], NS)
     rows["length"], rows["frame"] = len(name), name
-    rows["values"] = se3.in_space(poses)
-    return rows.view(np.uint8)
+    if len(rows):
+        rows["values"] = se3.in_space(poses[1:])
+    return b"".join((out.message(), rows.view(np.uint8).data))  # a megabyte, copied once
 
 
 def detections(stamp_ns: int, frame: str, names: Sequence[str], poses: Array, covariances: Array) -> bytes:

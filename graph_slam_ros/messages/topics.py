@@ -1,6 +1,7 @@
 """Names of the node's topics and services, except its inputs."""
 
 from dataclasses import dataclass
+from functools import partial
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,26 +23,24 @@ class Interface:
         return self.name if self.name.startswith("/") else f"{node.rpartition('/')[0]}/{self.name}"
 
 
+_latched = partial(Interface, latched=True)
+
 PUBLICATIONS = (
-    Interface("~/path", "nav_msgs/msg/Path", "the corrected path: every keyframe at its own stamp", latched=True),
+    _latched("~/path", "nav_msgs/msg/Path", "the corrected path: every keyframe at its own stamp"),
     Interface("~/path_updates", "nav_msgs/msg/Path", "the keyframes that are new or have moved"),
-    Interface(
-        "~/pose",
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "the newest keyframe in the map, with covariance",
-        latched=True,
+    _latched(
+        "~/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", "the newest keyframe in the map, with covariance"
     ),
     Interface("~/odometry", "nav_msgs/msg/Odometry", "the robot in the map, at each odometry message"),
-    Interface("~/landmarks", "visualization_msgs/msg/MarkerArray", "landmarks as 2-sigma ellipses", latched=True),
-    Interface(
+    _latched("~/landmarks", "visualization_msgs/msg/MarkerArray", "landmarks as 2-sigma ellipses"),
+    _latched(
         "~/landmarks_estimate",
         "vision_msgs/msg/Detection3DArray",
         "landmarks with identity, position or pose, covariance",
-        latched=True,
     ),
-    Interface("~/graph", "visualization_msgs/msg/MarkerArray", "vertices and edges of the graph", latched=True),
+    _latched("~/graph", "visualization_msgs/msg/MarkerArray", "vertices and edges of the graph"),
     Interface("~/events", "diagnostic_msgs/msg/DiagnosticArray", "events: new keyframes, verdicts, corrections"),
-    Interface("~/received", "std_msgs/msg/UInt64", "messages received, for the player's pace", latched=True),
+    _latched("~/received", "std_msgs/msg/UInt64", "messages received, for the player's pace"),
     Interface("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "state, counters, chi2, times"),
     Interface("/tf", "tf2_msgs/msg/TFMessage", "map -> odom"),
 )
@@ -53,7 +52,7 @@ SUBSCRIPTIONS = (
     Interface("initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped", "pose of the robot in the map"),
     Interface("~/remove", "std_msgs/msg/String", "remove one edge or landmark: `edge 231` or `landmark dock`"),
     Interface("/tf", "tf2_msgs/msg/TFMessage", "sensors on moving joints, inputs on TF"),
-    Interface("/tf_static", "tf2_msgs/msg/TFMessage", "poses of sensors on the robot", latched=True),
+    _latched("/tf_static", "tf2_msgs/msg/TFMessage", "poses of sensors on the robot"),
     Interface("/clock", "rosgraph_msgs/msg/Clock", "time, with use_sim_time"),
 )
 

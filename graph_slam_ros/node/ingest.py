@@ -89,14 +89,14 @@ class Ingest:
 
     # -- measurements ------------------------------------------------------------------------------------------------
 
-    def receive(self, measured: Sequence[Measured], cdr: bytes) -> None:
+    def receive(self, measured: Sequence[Measured]) -> None:
         """Pass on the measurements of a message, and earlier ones that its transforms complete."""
         if self.gate.is_from_before(measured):
             self.refuse("before_jump", measured)
             return
         newest = [m for m in measured if isinstance(m, Odometry) and self._is_newest(m)]
         if newest and self._publishes_odometry:
-            self._publish_odometry(newest[-1], cdr)
+            self._publish_odometry(newest[-1])
         for some in self._future_stamps.pass_on(measured):
             self.hand_over(some)
 
@@ -124,11 +124,12 @@ class Ingest:
         """Return whether odometry is the newest. A message ahead of the clock would stay the newest for long."""
         return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._run.session.estimate)
 
-    def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:
+    def _publish_odometry(self, m: Odometry) -> None:
         estimate, frames, unused = self._run.session.estimate, self._node.config.frames, to_msg.UNUSED
         if estimate is None or not estimate.is_located:
             return
-        twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
+        has_twist = m.source.partition("#")[0] in self._with_twist
+        twist = twist_of(self.converter.decoded, frames.base) if has_twist else None
         pose, covariance = self.extrapolator.pose(estimate)
         message = to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist)
         self._run.publishers.odometry(message)

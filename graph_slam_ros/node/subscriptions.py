@@ -19,8 +19,7 @@ from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, is_correction
-from graph_slam_ros.messages.inputs import uses
-from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
+from graph_slam_ros.messages.inputs import LANDMARK_TYPES, uses
 from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.node.diagnostics import InputFacts, Recent
 from graph_slam_ros.slam import Config
@@ -245,7 +244,7 @@ class Subscriptions:
                 if name in self._inputs:
                     self._inputs[name].note(given, now_ns)
                 measured += given
-            ingest.receive(measured, cdr)
+            ingest.receive(measured)
             ingest.check.add(topic.name, topic.inputs, now_ns, measured, ingest.converter.decoded)
 
         callback = _with_info(node.guarded(on_message), on_message)

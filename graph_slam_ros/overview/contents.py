@@ -9,9 +9,8 @@ from typing import Any
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.from_msg import TRANSFORMS
-from graph_slam_ros.messages.inputs import known_types
+from graph_slam_ros.messages.inputs import APRILTAGS, known_types
 from graph_slam_ros.messages.inputs.detections import names_of
-from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
 from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder

@@ -7,7 +7,7 @@ from typing import Any
 
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.messages.from_msg import TRANSFORMS
-from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
+from graph_slam_ros.messages.inputs import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.overview.chosen_inputs import TF_TOPIC, WORD, is_truth
 from graph_slam_ros.overview.contents import Recording, TopicContents

@@ -6,12 +6,11 @@ Intact and damaged files are read the same way. Everything intact is read; what 
 import heapq
 import re
 import shlex
-from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
@@ -72,19 +71,12 @@ class Bag:
 
     def _merged(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """The messages of several parts, split by time or topic. A part is opened when its time has come."""
-        if len(self._parts) == 1:
-            yield from self._of(self._parts[0], topics)
-            return
-        pending = deque(enumerate(self._parts))
-        heads: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
-        while pending or heads:
-            while pending and (not heads or pending[0][1].first_ns <= heads[0][0]):
-                number, part = pending.popleft()
-                _push(heads, number, self._of(part, topics))
-            if heads:
-                _, number, message, rest = heapq.heappop(heads)
-                yield message
-                _push(heads, number, rest)
+
+        def of(part: Part) -> Iterator[BagMessage]:
+            yield BagMessage("", part.first_ns, b"")
+            yield from self._of(part, topics)
+
+        return (m for m in heapq.merge(*map(of, self._parts), key=attrgetter("log_ns")) if m.topic)
 
     def _of(self, part: Part, topics: Collection[str]) -> Iterator[BagMessage]:
         losses, warnings, damaged = list[str](), list[str](), 0
@@ -144,17 +136,11 @@ def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         raise BagError(f"{path}: neither a file nor a folder")
     for suffix in _SUFFIXES:
-        found = sorted((file for file in path.glob(f"*{suffix}") if file.is_file()), key=_natural)
-        if found:
+        if found := sorted(file for file in path.glob(f"*{suffix}") if file.is_file()):
             return found
     within = [*dict.fromkeys(one.parent.name for suffix in _SUFFIXES for one in sorted(path.glob(f"*/*{suffix}")))]
     several = f"; give one of those in it: {', '.join(within[:_MOST_NAMED])}" if within else ""
     raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder{several}")
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key that puts bag_2 before bag_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _part(file: Path) -> Part:
@@ -221,12 +207,6 @@ def _names_in(metadata: Path) -> list[str]:
         return [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError):
         return []
-
-
-def _push(heads: list[Any], number: int, messages: Iterator[BagMessage]) -> None:
-    message = next(messages, None)
-    if message is not None:
-        heapq.heappush(heads, (message.log_ns, number, message, messages))
 
 
 def _in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:

@@ -11,8 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.messages.from_msg import TRANSFORMS, Decoder, own_decoder
-from graph_slam_ros.messages.inputs import known_types
-from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
+from graph_slam_ros.messages.inputs import LANDMARK_TYPES, known_types
 from graph_slam_ros.messages.inputs.plugins import input_type
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.part import BagError, Topic
@@ -160,24 +159,18 @@ def _of_noetic(type_name: str, md5: str) -> str:
 
 
 def _has_too_many_values(recorded: Any, type_name: str) -> bool:
-    return not _length({**typestore().fielddefs, **recorded}, type_name, {}) <= _MOST_VALUES
-
-
-def _length(types: Any, name: str, known: dict[str, float]) -> float:
-    """Return the least number of values of a message, with one element for each sequence."""
-    known[name] = float("inf")  # of a type that holds itself, there is no end
-    total = 0.0
-    for _, (kind, of) in types[name][1]:
-        count = 1
-        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            (inner, of), count = of[0], of[1] if kind == Nodetype.ARRAY else 1
-            kind, count = inner, count if inner == Nodetype.NAME else 1
-        if kind == Nodetype.NAME and of in types:
-            total += count * (known[of] if of in known else _length(types, of, known))
-        else:
-            total += 1
-    known[name] = total
-    return total
+    """Return whether a message with one element for each sequence is too long, or has no end as it holds itself."""
+    types, values, left = {**typestore().fielddefs, **recorded}, 0, [type_name]
+    while left and values <= _MOST_VALUES:
+        for _, (kind, of) in types[left.pop()][1]:
+            count = 1
+            if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                count = min(of[1], _MOST_VALUES) if kind == Nodetype.ARRAY else 1
+                kind, of = of[0]
+            values += 1
+            if kind == Nodetype.NAME and of in types:
+                left += [of] * count
+    return values > _MOST_VALUES
 
 
 def _store_with(recorded: Any) -> Typestore:

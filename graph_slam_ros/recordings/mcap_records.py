@@ -41,31 +41,12 @@ _READ: dict[int, Any] = {
     Opcode.STATISTICS: Statistics,
     Opcode.DATA_END: DataEnd,
 }
-_MOST_PADDING = 64  # a later version may add fields; after a damaged length there is more
+_MOST_PADDING = 32  # a later version may add fields; after a damaged length there is more
 _BLOCK, _FIRST_BLOCK = 2**20, 2**12
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, times of logging and publishing; then the data
 # A chunk's head: opcode, length, two times, size, checksum, codec; then the length of its data.
 _CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}))", re.DOTALL)
 _CHUNK_HEAD = 57
-
-
-class _File:
-    """A file whose parts are read whole, or not at all, because a length in a damaged file may be 2^60."""
-
-    def __init__(self, path: Path, follow: bool = True) -> None:
-        self.raw = opened(path, follow=follow)
-        self.size = os.fstat(self.raw.fileno()).st_size
-
-    def part(self, at: int, size: int) -> bytes:
-        if not 0 <= at <= self.size - size:
-            raise EndOfFile()
-        return os.pread(self.raw.fileno(), size, at)
-
-    def __enter__(self) -> "_File":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.raw.close()
 
 
 class _Whole(io.BytesIO):
@@ -89,6 +70,17 @@ class _Contents:
     first_ns: int = 2**64
 
 
+def _size(file: io.FileIO) -> int:
+    return os.fstat(file.fileno()).st_size
+
+
+def _part(file: io.FileIO, at: int, size: int) -> bytes:
+    """A part of a file, read whole or not at all, because a length in a damaged file may be 2^60."""
+    if not 0 <= at <= _size(file) - size:
+        raise EndOfFile()
+    return os.pread(file.fileno(), size, at)
+
+
 def begin(profile: str = "", library: str = LIBRARY) -> bytes:
     """Return the first bytes of a file that we write."""
     head = io.BytesIO()
@@ -102,7 +94,7 @@ class McapPart(Part):
     def __init__(self, file: Path) -> None:
         super().__init__(file)
         losses: list[str] = []
-        with _File(file) as stream:
+        with opened(file, follow=True) as stream:
             known = _summary(stream)
         if known.announced is None or not known.channels:
             known = _contents(records(file, losses))
@@ -150,12 +142,12 @@ def _contents(records: Iterable[McapRecord]) -> _Contents:
     return out
 
 
-def _summary(file: _File) -> _Contents:
+def _summary(file: io.FileIO) -> _Contents:
     """The contents by the summary at the end; empty where that is damaged or missing."""
     try:
-        end = file.size - MAGIC_SIZE - 4  # of the footer, but for the checksum of all from the summary on; 0: none
-        start, _, crc = struct.unpack("<QQI", file.part(end - 16, 20))
-        data = file.part(start, min(end - start, MOST_BYTES)) if start else b""
+        end = _size(file) - MAGIC_SIZE - 4  # of the footer, but for the checksum of all from the summary on; 0: none
+        start, _, crc = struct.unpack("<QQI", _part(file, end - 16, 20))
+        data = _part(file, start, min(end - start, MOST_BYTES)) if start else b""
         return _contents(_inside(data[: -16 - _HEAD.size])) if crc in (0, zlib.crc32(data)) else _Contents()
     except Exception:  # of a damaged file the library raises almost anything
         return _Contents()
@@ -172,14 +164,14 @@ def records(
     """
     known = len(losses)
     read, unchecked, is_unindexed = 0, False, False
-    with _File(path, follow) as file:
-        at = (_next_chunk(file, max(0, file.size - last_bytes)) or file.size) if last_bytes else MAGIC_SIZE
+    with opened(path, follow=follow) as file:
+        at = (_next_chunk(file, max(0, _size(file) - last_bytes)) or _size(file)) if last_bytes else MAGIC_SIZE
         while True:
             try:
                 record, after = _record(file, at)
             except Exception as error:  # see _summary
                 next_chunk = _next_chunk(file, at + 1)
-                losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, file.size)}")
+                losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, _size(file))}")
                 if next_chunk is None:
                     break
                 at = next_chunk
@@ -190,7 +182,7 @@ def records(
                 unchecked |= is_unindexed and not record.data_section_crc
                 if is_unindexed and record.data_section_crc not in (0, _checksum(file, at)):
                     losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
-                ends_whole = file.part(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+                ends_whole = _part(file, _size(file) - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
                 if len(losses) == known and not ends_whole:  # of a journal it may be more than the summary
                     where = losses if warnings is None else warnings
                     where.append(f"{path.name}: cut off in the summary at its end; all {read} messages were read")
@@ -210,20 +202,20 @@ def records(
         warnings.append(f"{path.name}: carries no checksums: more of it may be damaged than was found")
 
 
-def _record(file: _File, at: int) -> tuple[McapRecord | None, int]:
+def _record(file: io.FileIO, at: int) -> tuple[McapRecord | None, int]:
     """The record at a position, or nothing if it is of no interest, and the position of the next one.
 
     Raises almost any exception if the record is damaged.
     """
-    opcode, length = _HEAD.unpack(file.part(at, _HEAD.size))
+    opcode, length = _HEAD.unpack(_part(file, at, _HEAD.size))
     begins = at + _HEAD.size
-    if begins + length > file.size:
+    if begins + length > _size(file):
         raise EndOfFile()
     if opcode not in _READ:
         return None, begins + length
     if length > MOST_BYTES:
         raise FormatError(f"a record of {length} bytes; {MOST_BYTES} is the limit")
-    return _parsed(opcode, file.part(begins, length), 0, length), begins + length
+    return _parsed(opcode, _part(file, begins, length), 0, length), begins + length
 
 
 def _inside(data: bytes) -> Iterator[McapRecord]:
@@ -241,7 +233,9 @@ def _inside(data: bytes) -> Iterator[McapRecord]:
 
 def _parsed(opcode: int, data: bytes, begin: int, end: int) -> McapRecord:
     """A record of the data from begin to end."""
-    if opcode == Opcode.MESSAGE and end - begin >= _MESSAGE.size:  # the library reads number by number
+    if opcode == Opcode.MESSAGE:  # the library reads number by number
+        if end - begin < _MESSAGE.size:
+            raise EndOfFile()
         channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, begin)
         return Message(channel, log_ns, data[begin + _MESSAGE.size : end], publish_ns, sequence)
     stream = ReadDataStream(_Whole(data[begin:end]))
@@ -258,20 +252,20 @@ def _plain(chunk: Chunk) -> bytes:
     return plain
 
 
-def _next_chunk(file: _File, at: int) -> int | None:
+def _next_chunk(file: io.FileIO, at: int) -> int | None:
     """Return the position of the next intact chunk: its header is consistent, and its end is in the file.
 
     The search reads small blocks first and doubles their size, so that many forged headers cost little.
     """
     size = _FIRST_BLOCK
-    while (at := _data_from(file, at)) < file.size:
-        block = file.part(at, min(size + _CHUNK_HEAD, file.size - at))
+    while (at := _data_from(file, at)) < _size(file):
+        block = _part(file, at, min(size + _CHUNK_HEAD, _size(file) - at))
         for found in _CHUNK.finditer(block):
             if found.start() >= size:
                 break
             length, within = int.from_bytes(found[1], "little"), int.from_bytes(found[3], "little")
             begins = at + found.start()
-            is_whole = length == within + 36 + len(found[2]) and begins + _HEAD.size + length <= file.size
+            is_whole = length == within + 36 + len(found[2]) and begins + _HEAD.size + length <= _size(file)
             if is_whole and length <= MOST_BYTES:
                 return begins
         at += size
@@ -279,12 +273,12 @@ def _next_chunk(file: _File, at: int) -> int | None:
     return None
 
 
-def _data_from(file: _File, at: int) -> int:
+def _data_from(file: io.FileIO, at: int) -> int:
     """The next byte that is stored on the disk: a sparse file may claim a terabyte."""
     try:
-        return os.lseek(file.raw.fileno(), at, os.SEEK_DATA)
+        return os.lseek(file.fileno(), at, os.SEEK_DATA)
     except OSError as error:  # nothing follows; or the file system does not know
-        return file.size if error.errno == errno.ENXIO else at
+        return _size(file) if error.errno == errno.ENXIO else at
 
 
 def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: int) -> str:
@@ -297,8 +291,8 @@ def _what(error: Exception) -> str:
     return str(error) if isinstance(error, FormatError) else type(error).__name__
 
 
-def _checksum(file: _File, end: int) -> int:
+def _checksum(file: io.FileIO, end: int) -> int:
     crc = 0
     for at in range(0, end, _BLOCK):
-        crc = zlib.crc32(file.part(at, min(_BLOCK, end - at)), crc)
+        crc = zlib.crc32(_part(file, at, min(_BLOCK, end - at)), crc)
     return crc

@@ -83,11 +83,7 @@ def _refuse_others(database: sqlite3.Connection, path: Path) -> None:
 
 def _counted(database: sqlite3.Connection) -> tuple[dict[int, int], int]:
     """Messages by topic, and the time of the first, up to the first damage."""
-    try:
-        counts = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
-        return counts, int(database.execute("SELECT MIN(timestamp) FROM messages").fetchone()[0])
-    except (sqlite3.Error, TypeError, ValueError):  # empty, or damaged farther on
-        counts, first_ns = {}, 2**64
+    counts, first_ns = dict[int, int](), 2**64
     with suppress(sqlite3.Error):
         for topic, stamp in database.execute("SELECT topic_id, timestamp FROM messages ORDER BY id"):
             if isinstance(topic, int) and isinstance(stamp, int):

@@ -18,8 +18,7 @@ from graph_slam_ros.config.inputs import ASSUMED, default_input
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS
-from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
-from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
+from graph_slam_ros.messages.inputs import APRILTAGS, CONVERTERS, LANDMARK_TYPES, converters, known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.overview.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, Inputs, choose_inputs, is_truth
 from graph_slam_ros.overview.contents import Recording, TopicContents, recording_of

@@ -1,4 +1,7 @@
-"""The table of message types that can be inputs: their uses, and their converters.
+"""The types of messages that can be inputs: their uses, converters, and the fields that are read.
+
+A new type of landmarks is a row of ``LANDMARK_TYPES``, and a generator in ``detections`` or ``ranges`` where ``marks``
+does not read it: all else is made of the row.
 
 A converter is a function of an input (``InputContext``) and a message. It raises ``MessageError`` to refuse the whole
 message, and ``NotYet`` if a transform is missing that may still come.
@@ -6,7 +9,9 @@ message, and ``NotYet`` if a transform is missing that may still come.
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 from graph_slam_ros.config.config import Config
@@ -15,13 +20,14 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import detections, fixes, odometry, plugins, ranges
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
 from graph_slam_ros.messages.inputs.plugins import InputType
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet
 
 __all__ = [
+    "APRILTAGS",
     "CONVERTERS",
+    "LANDMARK_TYPES",
     "InputContext",
     "InputType",
     "MessageError",
@@ -37,6 +43,53 @@ __all__ = [
 _CLOSE = 0.8  # of 1
 
 Converter = Callable[[InputContext, Any], Iterable[Measured]]
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkType:
+    """A type of landmark messages, and its reader.
+
+    Attributes
+    ----------
+    input_name : what ``graph_slam info`` calls an input of this type
+    read : yields one ``ObservedLandmark`` for each landmark of a message
+    fields : the fields that ``read`` uses, of the message and of its parts from the same package
+    """
+
+    input_name: str
+    read: Callable[[InputContext, Any], Iterable[ObservedLandmark]]
+    fields: str
+
+
+def _marks(*things: str) -> LandmarkType:
+    """Tags in arrays, of each the fields: the array, and in it identity and pose."""
+    read = partial(detections.marks, [one.split() for one in things])
+    return LandmarkType("tags", read, " ".join(("header", *things)))
+
+
+APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
+_APRILTAGS = "header detections family id hamming decision_margin"
+_WEIGHED = "header landmarks id tracking_from_landmark_transform translation_weight rotation_weight"
+_BEACON = "header sensor_pose_on_robot sensor_std_range sensed_data range id"
+
+LANDMARK_TYPES: Mapping[str, LandmarkType] = {
+    APRILTAGS: LandmarkType("tags", detections.apriltags, _APRILTAGS),
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": _marks("detections id pose"),
+    "apriltag_ros/msg/AprilTagDetectionArray": _marks("detections id pose"),
+    "apriltags_ros/msg/AprilTagDetectionArray": _marks("detections id pose"),
+    "ar_track_alvar_msgs/msg/AlvarMarkers": _marks("markers id pose"),
+    "aruco_msgs/msg/MarkerArray": _marks("markers id pose"),
+    "aruco_markers_msgs/msg/MarkerArray": _marks("markers id pose"),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": LandmarkType("tags", detections.ros2_aruco, "header marker_ids poses"),
+    "aruco_opencv_msgs/msg/ArucoDetection": _marks("markers marker_id pose", "boards board_name pose"),
+    "fiducial_msgs/msg/FiducialTransformArray": _marks("transforms fiducial_id transform"),
+    "rtabmap_msgs/msg/LandmarkDetections": LandmarkType("tags", detections.rtabmap, "header landmarks id pose"),
+    "cartographer_ros_msgs/msg/LandmarkList": LandmarkType("reflectors", detections.cartographer, _WEIGHED),
+    "mrpt_msgs/msg/ObservationRangeBearing": LandmarkType(
+        "beacons", ranges.mrpt, f"{_BEACON} sensor_std_yaw sensor_std_pitch yaw pitch"
+    ),
+    "mrpt_msgs/msg/ObservationRangeBeacon": LandmarkType("beacons", ranges.mrpt, _BEACON),
+}
 
 
 def _landmarks(read: Callable[[InputContext, Any], Iterable[ObservedLandmark]]) -> Converter:

@@ -2,16 +2,17 @@
 
 import math
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from graph_slam_ros.formats.cdr import LATEST_NS, NS
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.edge_noise import LEAST_M2, LEAST_RAD2
-from graph_slam_ros.typing import Array, Mask
+from graph_slam_ros.typing import Array
 
 _NORM_REPAIRED = 0.1  # a quaternion this far from unit length is normalised, beyond it is refused
-_NORM_EXACT, _SQUARE_EXACT = 1e-6, 1.9e-6
+_SQUARE_EXACT = 2e-6
 _ASYMMETRY_REPAIRED, _ASYMMETRY_EXACT = 1e-2, 1e-6
 _DEFICIT_REPAIRED = 1e-9  # negative eigenvalues down to this fraction of the largest are rounding
 _FARTHEST_M = 1e9
@@ -19,44 +20,55 @@ _MOST_M2, _MOST_RAD2 = 1e6, 1e3  # as good as unknown; drivers send up to 1.8e30
 _MOST_TURNED_RAD = 4.0 * math.pi  # a bearing that is farther from zero is no count of turns
 
 
+Number = TypeVar("Number", bound=Any)
+
+
 class MessageError(Exception):
     """A message, or one item of it, that is refused; its text is the reason it is counted under."""
 
 
-def stamp_ns(stamp: Any) -> int:
-    """Nanoseconds of a builtin_interfaces/Time."""
-    if stamp.sec < 0 or not 0 <= stamp.nanosec < 1_000_000_000:
-        raise MessageError("bad_stamp")
-    out = stamp.sec * 1_000_000_000 + stamp.nanosec
-    if out == 0:
-        raise MessageError("zero_stamp")
-    return int(out)
+# Of numbers, and of arrays of them.
 
 
-def are_sound(x: Array, y: Array, z: Array) -> Mask:
-    """Return whether ``point`` accepts coordinates."""
+def stamps_ns(sec: Number, nanosec: Number, offset_ns: int = 0) -> Number:
+    """Nanoseconds of builtin_interfaces/Time, moved by an offset; 0 where it is no stamp."""
+    out = sec * NS + nanosec + offset_ns
+    is_stamp = (sec >= 0) & (nanosec >= 0) & (nanosec < NS) & ((sec > 0) | (nanosec > 0))
+    return out * (is_stamp & (out > 0) & (out <= LATEST_NS))
+
+
+def are_sound(x: Number, y: Number, z: Number) -> Any:
+    """Return whether coordinates are finite, and of plausible size."""
     return (abs(x) <= _FARTHEST_M) & (abs(y) <= _FARTHEST_M) & (abs(z) <= _FARTHEST_M)
 
 
-def are_units(x: Array, y: Array, z: Array, w: Array) -> Mask:
-    """Return whether ``quaternion`` surely returns the numbers as they are."""
+def are_units(x: Number, y: Number, z: Number, w: Number) -> Any:
+    """Return whether a quaternion has unit length."""
     return abs(x * x + y * y + z * z + w * w - 1.0) <= _SQUARE_EXACT
 
 
+# Of the parts of a message.
+
+
+def stamp_ns(stamp: Any, offset_ns: int = 0) -> int:
+    """Nanoseconds of a builtin_interfaces/Time, moved by an offset."""
+    if out := stamps_ns(stamp.sec, stamp.nanosec, offset_ns):
+        return int(out)
+    raise MessageError("bad_stamp" if stamp.sec or stamp.nanosec else "zero_stamp")
+
+
 def point(v: Any) -> tuple[float, float, float]:
-    """Finite coordinates of a Point or Vector3 of plausible size."""
-    if not (math.isfinite(v.x) and math.isfinite(v.y) and math.isfinite(v.z)):
-        raise MessageError("nonfinite")
-    if max(abs(v.x), abs(v.y), abs(v.z)) > _FARTHEST_M:
-        raise MessageError("too_far")
+    """Coordinates of a Point or Vector3."""
+    if not are_sound(v.x, v.y, v.z):
+        raise MessageError("too_far" if all(map(math.isfinite, (v.x, v.y, v.z))) else "nonfinite")
     return float(v.x), float(v.y), float(v.z)
 
 
 def quaternion(q: Any) -> tuple[tuple[float, float, float, float], bool]:
     """Unit quaternion (x, y, z, w), and whether it had to be normalised."""
-    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-    if abs(norm - 1.0) <= _NORM_EXACT:
+    if are_units(q.x, q.y, q.z, q.w):
         return (q.x, q.y, q.z, q.w), False
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if not math.isfinite(norm):
         raise MessageError("nonfinite")
     if norm == 0.0:

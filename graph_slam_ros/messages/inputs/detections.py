@@ -86,19 +86,17 @@ def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """apriltag_msgs/AprilTagDetectionArray: poses are on /tf below the header's frame, named by family and id."""
     settings, stamp_ns = source.settings, source.stamp_ns(m.header.stamp)
     camera = settings.frame or m.header.frame_id.removeprefix("/")
-    for one in m.detections:
-        if one.hamming > settings.hamming_max or one.decision_margin < settings.decision_margin_min:
-            source.count("poor_tag")
-            continue
-        name = f"{one.family}:{one.id}"
-        try:
-            at = source.T_sensor(camera, name, stamp_ns)
-        except MessageError as reason:
-            source.count(str(reason))
-            continue
-        x, y, z, qx, qy, qz, qw = at
+
+    def seen(name: str) -> ObservedLandmark:
+        x, y, z, qx, qy, qz, qw = source.T_sensor(camera, name, stamp_ns)
         position, orientation = SimpleNamespace(x=x, y=y, z=z), SimpleNamespace(x=qx, y=qy, z=qz, w=qw)
-        yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, position, orientation)
+        return ObservedLandmark(m.header.stamp, m.header.frame_id, name, position, orientation)
+
+    least = settings.decision_margin_min
+    good = [one for one in m.detections if one.hamming <= settings.hamming_max and not one.decision_margin < least]
+    if len(good) < len(m.detections):
+        source.count("poor_tag", len(m.detections) - len(good))
+    yield from source.each((f"{one.family}:{one.id}" for one in good), seen)
 
 
 def marks(things: Sequence[Sequence[str]], source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

@@ -1,7 +1,8 @@
 """Messages with the robot's pose in the map (fixes), or relative to an earlier pose (closures)."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from graph_slam_ros.measurements.types import Closure, Fix, InitialPose
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.source import InputContext
-from graph_slam_ros.messages.inputs.transforms import pose
 from graph_slam_ros.typing import Array
 
 _NO_FIX = -1
@@ -41,7 +41,7 @@ def pose_fix(source: InputContext, m: Any) -> Iterator[Fix]:
         block = source.checked(covariance[:n, :n], n)
         yield Fix(stamp_ns, source.name, "position", measured, block, arm if any(arm) else ())
         return
-    T_map_sensor = se3.compose(T_map_frame, pose(p.position, source.unit(p.orientation)))
+    T_map_sensor = se3.compose(T_map_frame, source.placed(p.position, p.orientation))
     T_map_base = se3.compose(T_map_sensor, se3.inverse(T_base_sensor))
     if not source.has_heading(T_map_base):
         raise MessageError("no_heading")
@@ -57,8 +57,7 @@ def initial_pose(source: InputContext, m: Any) -> Iterator[InitialPose]:
     """geometry_msgs/PoseWithCovarianceStamped in the map frame: the present pose of the base, given by a person."""
     frame = source.frame(m.header.frame_id)
     T_map_frame = source.T_fixed(source.config.frames.map, frame)
-    checks.point(m.pose.pose.position)
-    T_map_base = se3.compose(T_map_frame, pose(m.pose.pose.position, source.unit(m.pose.pose.orientation)))
+    T_map_base = se3.compose(T_map_frame, source.placed(m.pose.pose.position, m.pose.pose.orientation))
     if not source.has_heading(T_map_base):
         raise MessageError("no_heading")
     covariance = SPATIAL.in_parent_axes(T_map_frame, source.pose_covariance(m.pose.covariance, 0.0))
@@ -151,18 +150,13 @@ def imu(source: InputContext, m: Any) -> Iterator[Fix]:
     yield Fix(stamp_ns, source.name, "attitude", T_map_base[3:], block)
 
 
-def closures(source: InputContext, m: Any) -> Iterator[Closure]:
+def closures(source: InputContext, m: Any) -> Iterable[Closure]:
     """vision_msgs/Detection3DArray as loop closures: where the robot's base was earlier is what is detected.
 
     Its pose in the header's frame at the header's stamp, with its covariance; ``id`` is the earlier stamp in
     nanoseconds. Of the standard messages only this one holds two stamps, a pose and a covariance.
     """
-    stamp_ns = source.stamp_ns(m.header.stamp)
-    for one in m.detections:
-        try:
-            yield _closure(source, stamp_ns, m.header.frame_id, one)
-        except MessageError as reason:
-            source.count(str(reason))
+    return source.each(m.detections, partial(_closure, source, source.stamp_ns(m.header.stamp), m.header.frame_id))
 
 
 def _closure(source: InputContext, stamp_ns: int, frame: str, one: Any) -> Closure:
@@ -174,8 +168,7 @@ def _closure(source: InputContext, stamp_ns: int, frame: str, one: Any) -> Closu
     if not len(one.results):
         raise MessageError("no_result")
     at = one.results[0].pose
-    checks.point(at.pose.position)
-    T_frame_earlier = pose(at.pose.position, source.unit(at.pose.orientation))
+    T_frame_earlier = source.placed(at.pose.position, at.pose.orientation)
     covariance = source.pose_covariance(at.covariance, 0.0)
     if not source.block(covariance).any():
         raise MessageError("noise_unknown")

@@ -6,6 +6,7 @@ A converter of a type only reads: it yields one ``ObservedLandmark`` for each la
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -73,20 +74,8 @@ def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterat
     by_stamp: dict[tuple[int, int], list[ObservedLandmark]] = {}
     for one in _nearest(source, list(found)):
         by_stamp.setdefault((one.stamp.sec, one.stamp.nanosec), []).append(one)
-    for same in by_stamp.values():
-        try:
-            stamp_ns = source.stamp_ns(same[0].stamp)
-        except MessageError as reason:
-            source.count(str(reason))
-            continue
-        seen = []
-        for one in same:
-            try:
-                what = _sighting(source, stamp_ns, one)
-                seen.append(what if what.id else replace(what, sort=one.sort, size=_size(source, one.size)))
-            except MessageError as reason:
-                source.count(str(reason))
-        usable = _agreed(source, seen)
+    for stamp_ns, seen in source.each(by_stamp.values(), lambda same: (source.stamp_ns(same[0].stamp), same)):
+        usable = _agreed(source, [*source.each(seen, partial(_sighting, source, stamp_ns))])
         if usable:
             yield Sightings(stamp_ns, source.name, tuple(usable))
 
@@ -116,6 +105,11 @@ def _reach(seen: ObservedLandmark) -> float:
 
 
 def _sighting(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Sighting:
+    out = _measured(source, stamp_ns, seen)
+    return out if out.id else replace(out, sort=seen.sort, size=_size(source, seen.size))
+
+
+def _measured(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Sighting:
     name = _identity(source, seen.id)
     T_base_frame = source.T_base(source.frame(seen.frame), stamp_ns)
     if seen.polar is not None:

@@ -1,7 +1,8 @@
 """Messages that become odometry: absolute poses in a frame that drifts, and the turn rate of a gyro."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
 from graph_slam_ros.messages.inputs.source import InputContext
-from graph_slam_ros.messages.inputs.transforms import pose
 from graph_slam_ros.typing import Numbers
 
 TYPE = "nav_msgs/msg/Odometry"
@@ -25,7 +25,7 @@ def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
     """nav_msgs/Odometry, decoded; ``of_run`` does the same for many at once."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     p, parent = m.pose.pose, source.frame(m.header.frame_id)
-    at = _in_odom(source, parent, _named(source, m.child_frame_id), p.position, p.orientation)
+    at = _in_odom(source, parent, source.named(m.child_frame_id), p.position, p.orientation)
     twist = None
     if source.config.odometry.noise == "twist" and m.child_frame_id.lstrip("/") == source.config.frames.base:
         twist = _twist_covariance(source, m.twist.covariance)  # that of another point of the robot says nothing
@@ -33,22 +33,29 @@ def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
 
 
 @np.errstate(all="ignore")  # of strange numbers, which are decoded and refused by name
-def of_run(source: InputContext, read: OdometryRun, after_ns: int) -> list[Odometry]:
+def of_run(source: InputContext, read: OdometryRun, after_ns: int) -> tuple[list[Odometry], list[str]]:
     """The odometry of the first messages of a run, as far as stamps ascend, and nothing is refused or repaired.
 
-    Only their covariance may be repaired, which is for ``count_repairs``.
+    Only the covariance of their twist may be repaired. It was judged before, with a message that was decoded.
 
     Parameters
     ----------
     after_ns : a stamp that the first is later than
+
+    Returns
+    -------
+    The odometry, and the repairs of each.
     """
-    if not _is_of_base(source, read) or not _is_judged(source, read.twist_covariance):
-        return []
-    numbers, stamps = read.numbers[:, :7], source.valid_stamps_ns(read.sec, read.nanosec)
+    needs_twist, state = source.config.odometry.noise == "twist", source.state
+    twist, repairs = state.get("judged", (None, [])) if needs_twist else (None, [])
+    is_judged = not needs_twist or (read.twist_covariance == state.get("raw") and not isinstance(twist, MessageError))
+    if not _is_of_base(source, read) or not is_judged:
+        return [], []
+    numbers, stamps = read.numbers[:, :7], checks.stamps_ns(read.sec, read.nanosec, source.offset_ns)
     are_sound = checks.are_sound(*numbers[:, :3].T) & checks.are_units(*numbers[:, 3:].T)
     poses = source.of_robots_in_plane(numbers, are_sound & (np.diff(stamps, prepend=after_ns) > 0))
-    twist = source.state["judged"][0] if source.config.odometry.noise == "twist" else None
-    return [Odometry(stamp, at, twist, source.name) for stamp, at in zip(stamps.tolist(), poses, strict=False)]
+    run = [Odometry(stamp, at, twist, source.name) for stamp, at in zip(stamps.tolist(), poses, strict=False)]
+    return run, repairs
 
 
 def _is_of_base(source: InputContext, read: OdometryRun) -> bool:
@@ -56,19 +63,6 @@ def _is_of_base(source: InputContext, read: OdometryRun) -> bool:
     frames, parent, child = source.config.frames, source.settings.frame or read.frame_id, read.child_frame_id
     is_of_base = parent == frames.odom and child == frames.base and parent != child
     return is_of_base and child[:1] not in _SLASHED and parent[:1] != "/"
-
-
-def _is_judged(source: InputContext, raw: bytes) -> bool:
-    """Return whether the twist's covariance is not needed, or was accepted before; else the decoded message tells."""
-    if source.config.odometry.noise != "twist":
-        return True
-    return raw == source.state.get("raw") and not isinstance(source.state["judged"][0], MessageError)
-
-
-def count_repairs(source: InputContext, times: int) -> None:
-    """Count the repairs of that covariance for so many messages."""
-    for repair in source.state["judged"][1] if source.config.odometry.noise == "twist" else ():
-        source.count(repair, times)
 
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[Odometry]:
@@ -79,29 +73,30 @@ def pose_stamped(source: InputContext, m: Any) -> Iterator[Odometry]:
     yield Odometry(stamp_ns, _in_odom(source, parent, "", p.position, p.orientation), None, source.name)
 
 
-def transforms(source: InputContext, m: Any) -> Iterator[Odometry]:
+def transforms(source: InputContext, m: Any) -> Iterable[Odometry]:
     """tf2_msgs/TFMessage: the transform from odometry's frame, or from the configured one, to the base."""
-    frames = source.config.frames
-    parent = source.settings.frame or frames.odom
-    for t in m.transforms:
-        above, child = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
-        is_of_robot = source.transforms.lookup(frames.base, child) is not None
-        if above != parent or not is_of_robot:
-            _note_similar(source, above, child, is_similar=above == parent or (is_of_robot and above != frames.map))
-            continue  # /tf tells of everything
+    own = [t for t in m.transforms if _is_of_robot(source, t)]  # /tf tells of everything
+    return source.each(own, partial(_of_transform, source))
+
+
+def _of_transform(source: InputContext, t: Any) -> Odometry:
+    stamp_ns, child, at = source.stamp_ns(t.header.stamp), t.child_frame_id.lstrip("/"), t.transform
+    T_odom_base = _in_odom(source, source.config.frames.odom, child, at.translation, at.rotation)
+    return Odometry(stamp_ns, T_odom_base, None, source.name)
+
+
+def _is_of_robot(source: InputContext, t: Any) -> bool:
+    """Return whether a transform is odometry; of others, the first that may be meant are remembered."""
+    frames, parent, child = source.config.frames, t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
+    is_in_odom = parent == (source.settings.frame or frames.odom)
+    is_of_robot = source.transforms.lookup(frames.base, child) is not None
+    if is_in_odom and is_of_robot:
         source.state["found"] = True
-        try:
-            stamp_ns = source.stamp_ns(t.header.stamp)
-            at = _in_odom(source, frames.odom, child, t.transform.translation, t.transform.rotation)
-            yield Odometry(stamp_ns, at, None, source.name)
-        except MessageError as reason:
-            source.count(str(reason))
-
-
-def _note_similar(source: InputContext, parent: str, child: str, *, is_similar: bool) -> None:
+        return True
     similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
-    if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
+    if (is_in_odom or (is_of_robot and parent != frames.map)) and len(similar) < _MOST_SIMILAR:
         similar[parent, child] = None
+    return False
 
 
 def angular_velocity(source: InputContext, m: Any) -> Iterator[AngularVelocity]:
@@ -145,23 +140,12 @@ def not_found(source: InputContext) -> str:
 def _in_odom(source: InputContext, parent: str, child: str, position: Any, orientation: Any) -> Numbers:
     if parent == child:
         raise MessageError("frame_in_itself")
-    checks.point(position)
-    q = source.unit(orientation)
-    frames = source.config.frames
+    T_parent_child, frames = source.placed(position, orientation), source.config.frames
     if parent == frames.odom and child == frames.base:
-        return source.of_robot(pose(position, q))
+        return source.of_robot(T_parent_child)
     T_odom_parent = source.T_fixed(frames.odom, parent)
     T_child_base = se3.inverse(source.T_base_child(child))
-    return source.of_robot(se3.compose(se3.compose(T_odom_parent, pose(position, q)), T_child_base))
-
-
-def _named(source: InputContext, child: str) -> str:
-    if child.startswith("/"):
-        source.count("frame_slash_stripped")
-        child = child[1:]
-    if not child and not source.settings.mount:
-        raise MessageError("frame_empty")
-    return child
+    return source.of_robot(se3.compose(se3.compose(T_odom_parent, T_parent_child), T_child_base))
 
 
 def _twist_covariance(source: InputContext, flat: Any) -> Numbers | None:

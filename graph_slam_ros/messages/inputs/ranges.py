@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark
 from graph_slam_ros.messages.inputs.source import InputContext
-from graph_slam_ros.messages.inputs.transforms import pose
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _CLASSES = "class_id", "class"
@@ -92,8 +90,7 @@ def _identity(value: float | int | None) -> str:
 def mrpt(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """mrpt_msgs/ObservationRangeBearing, ObservationRangeBeacon: pitch is positive downwards, an id of -1 is none."""
     at = m.sensor_pose_on_robot
-    checks.point(at.position)
-    T_frame_sensor = pose(at.position, source.unit(at.orientation))
+    T_frame_sensor = source.placed(at.position, at.orientation)
     has_bearing = hasattr(m, "sensor_std_yaw")
     sigmas = (m.sensor_std_range, m.sensor_std_yaw, m.sensor_std_pitch) if has_bearing else (m.sensor_std_range,)
     for one in m.sensed_data:

@@ -2,19 +2,22 @@
 
 import math
 from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import ASSUMED, InputConfig
-from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount
-from graph_slam_ros.typing import Array, Index, Mask, Numbers
+from graph_slam_ros.typing import Array, Mask, Numbers
+
+Item = TypeVar("Item")
+Out = TypeVar("Out")
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
@@ -54,27 +57,26 @@ class InputContext:
 
     Attributes
     ----------
+    offset_ns : what its stamps are moved by
     tally : refusals and repairs of the present message by reason
-    hurried : whether nothing is waited for any more
+    is_hurried : whether nothing is waited for any more
     state : what converters have to remember between messages
     unlinked : frames of the last messages and the frames that nothing links them to
     """
 
-    def __init__(
-        self, settings: InputConfig, use: str, config: Config, transforms: Transforms, origin: Origin | None = None
-    ) -> None:
+    def __init__(self, settings: InputConfig, use: str, config: Config, transforms: Transforms, origin: Origin) -> None:
         self.name = settings.name
         self.settings = settings
         self.use = use
         self.config = config
         self.space = config.space
         self.transforms = transforms
-        self.origin = origin or Origin()
+        self.origin = origin
         self.tally: Counter[str] = Counter()
-        self.hurried = not config.inputs.tf
+        self.is_hurried = False
         self.state: dict[str, Any] = {}
         self.unlinked: deque[tuple[str, str]] = deque(maxlen=4)
-        self._offset_ns = round(settings.offset_s * 1e9)
+        self.offset_ns = round(settings.offset_s * 1e9)
         self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
         mount = settings.numbers("mount", 6)
         self._mount = se3.from_xyz_rpy(mount) if mount else None
@@ -83,25 +85,26 @@ class InputContext:
         """Count a refusal or a repair."""
         self.tally[reason] += times
 
+    def each(self, items: Iterable[Item], convert: Callable[[Item], Out]) -> Iterator[Out]:
+        """What is made of each item of a message; one that is refused is counted, and the others go on."""
+        for one in items:
+            try:
+                yield convert(one)
+            except MessageError as reason:
+                self.count(str(reason))
+
     def stamp_ns(self, stamp: Any) -> int:
         """The stamp of a header, in the clock of the robot."""
-        out = checks.stamp_ns(stamp) + self._offset_ns
-        if not 0 < out <= LATEST_NS:
-            raise MessageError("bad_stamp")
-        return out
-
-    def valid_stamps_ns(self, sec: Index, nanosec: Index) -> Index:
-        """The same for arrays of seconds and nanoseconds; 0 where a stamp would be refused."""
-        out = sec * 1_000_000_000 + nanosec + self._offset_ns
-        is_stamp = (sec >= 0) & (nanosec >= 0) & (nanosec < 1_000_000_000) & ((sec > 0) | (nanosec > 0))
-        return out * (is_stamp & (out > 0) & (out <= LATEST_NS))
+        return checks.stamp_ns(stamp, self.offset_ns)
 
     # -- frames ------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> str:
         """The configured frame, else that of the message."""
-        if self.settings.frame:
-            return self.settings.frame
+        return self.settings.frame or self.named(name)
+
+    def named(self, name: str) -> str:
+        """The name of a frame in a message; empty only where the mount is configured."""
         if name.startswith("/"):
             self.count("frame_slash_stripped")
             name = name[1:]
@@ -110,34 +113,18 @@ class InputContext:
         return name
 
     def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
-        """Return the pose of a frame on the robot, by TF, else as configured.
-
-        Raises
-        ------
-        NotYet
-            Neither tells, and odometry is not much newer than the stamp.
-        """
-        found = self.transforms.lookup(self.config.frames.base, frame, stamp_ns)
-        if found is not None:
-            return found
-        if self._mount is not None and not self.transforms.knows(frame):
-            return self._mounted(frame, self._mount)
-        are_linked = self.transforms.are_linked(self.config.frames.base, frame)
-        if self._may_come(stamp_ns):
-            raise NotYet(are_linked)
-        if self._mount is not None and not are_linked:
-            return self._mounted(frame, self._mount)
-        raise self._not_linked("transform_gaps" if are_linked else "frame_unknown", frame, self.config.frames.base)
-
-    def _mounted(self, frame: str, mount: se3.Pose) -> se3.Pose:
-        """Return the configured mount, or the assumed one, which is counted."""
+        """Return the pose of a frame on the robot, by TF, else as configured. Raises NotYet as ``T_sensor`` does."""
+        base = self.config.frames.base
+        tells = self.transforms.are_linked(base, frame) or self._may_come(stamp_ns)
+        if self._mount is None or frame == base or (tells and self.transforms.knows(frame)):
+            return self.T_sensor(base, frame, stamp_ns)
         if self.settings.mount != ASSUMED:
-            return mount
+            return self._mount
         self.count("mount_assumed")
         return se3.from_xyz_rpy(tuple(map(float, assumed_mount(frame).split())))
 
     def T_sensor(self, sensor: str, seen: str, stamp_ns: int) -> se3.Pose:
-        """Return the pose of a frame that a detector publishes on /tf, in the frame of its sensor.
+        """Return the pose of a frame by TF in another, such as what a detector publishes in that of its sensor.
 
         Raises
         ------
@@ -167,7 +154,7 @@ class InputContext:
 
     def _may_come(self, stamp_ns: int) -> bool:
         now_ns = self.transforms.now_ns
-        return not (self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
+        return not (self.is_hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
 
     def T_base_child(self, child: str) -> se3.Pose:
         """Return the fixed pose of a frame on the robot. An empty name is the configured mount, or the base."""
@@ -183,10 +170,9 @@ class InputContext:
     def T_fixed(self, target: str, frame: str) -> se3.Pose:
         """The transform between two frames that do not move: that of a message, and that of odometry or of the map."""
         found = self.transforms.lookup(target, frame)
-        if found is None and target == self.config.frames.odom:
-            raise self._not_linked("odom_frame_unknown", frame, target)
         if found is None:
-            raise self._not_linked("map_frame_unknown", frame, target)
+            of_odometry = target == self.config.frames.odom
+            raise self._not_linked("odom_frame_unknown" if of_odometry else "map_frame_unknown", frame, target)
         return found
 
     def _not_linked(self, reason: str, frame: str, target: str) -> MessageError:
@@ -195,6 +181,10 @@ class InputContext:
         return MessageError(reason)
 
     # -- rotations ---------------------------------------------------------------------------------------------------
+
+    def placed(self, position: Any, orientation: Any) -> se3.Pose:
+        """The pose of a message, from its position or translation, and its orientation or rotation."""
+        return (*checks.point(position), *self.unit(orientation))
 
     def unit(self, q: Any) -> so3.Quaternion:
         """Unit quaternion (x, y, z, w) of a message."""

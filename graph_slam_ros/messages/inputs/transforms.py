@@ -2,9 +2,9 @@
 
 from bisect import bisect_left
 from collections.abc import Callable
-from typing import Any
+from operator import itemgetter
 
-from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
 
 MAP_FRAMES = ("map", "earth", "utm")
@@ -18,18 +18,12 @@ def assumed_mount(frame: str) -> str:
     return OPTICAL if "optical" in frame else "0 0 0 0 0 0"
 
 
-def pose(translation: Any, rotation: so3.Quaternion) -> se3.Pose:
-    """A pose from a translation or position message and a unit quaternion."""
-    x, y, z, w = rotation
-    return float(translation.x), float(translation.y), float(translation.z), x, y, z, w
-
-
 class Transforms:
     """The transforms of /tf_static and /tf so far.
 
     Parameters
     ----------
-    keep_ns : how much older than its newest a transform of /tf may get
+    keep_ns : how much older than its newest a transform of /tf may get; as of tf2
     refuse : called once for each of /tf that is dated farther than that from the others of its frame, and from odometry
 
     Attributes
@@ -116,38 +110,29 @@ class _Joint:
     def __init__(self, parent: str, keep_ns: int, refuse: Callable[[], None]) -> None:
         self.parent, self._keep_ns = parent, keep_ns
         self._leap = StampLeap[se3.Pose](refuse)
-        self._stamps_ns: list[int] = []
-        self._poses: list[se3.Pose] = []
+        self._poses: list[tuple[int, se3.Pose]] = []  # by ascending stamp
 
     def add(self, stamp_ns: int, T_parent_child: se3.Pose, now_ns: int | None) -> None:
-        newest_ns = self._stamps_ns[-1] if self._stamps_ns else stamp_ns
+        newest_ns = self._poses[-1][0] if self._poses else stamp_ns
         if now_ns is not None and abs(stamp_ns - now_ns) < abs(stamp_ns - newest_ns):
             newest_ns = now_ns  # seen again after a while, such as the frame of a tag: no leap
-        for at_ns, pose in self._leap.accept(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
-            if self._stamps_ns and at_ns < self._stamps_ns[-1] - self._keep_ns:  # several agree that it is so early
-                self._stamps_ns.clear()
+        for one in self._leap.accept(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
+            if self._poses and one[0] < self._poses[-1][0] - self._keep_ns:  # several agree that it is so early
                 self._poses.clear()
-            self._add(at_ns, pose)
-
-    def _add(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
-        at = bisect_left(self._stamps_ns, stamp_ns)
-        if at < len(self._stamps_ns) and self._stamps_ns[at] == stamp_ns:
-            self._poses[at] = T_parent_child
-            return
-        self._stamps_ns.insert(at, stamp_ns)
-        self._poses.insert(at, T_parent_child)
-        old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - self._keep_ns)
-        del self._stamps_ns[:old], self._poses[:old]
+            at = self._place(one[0])
+            is_again = at < len(self._poses) and self._poses[at][0] == one[0]
+            self._poses[at : at + is_again] = [one]
+            del self._poses[: self._place(self._poses[-1][0] - self._keep_ns)]
 
     def at(self, stamp_ns: int) -> se3.Pose | None:
         """Interpolated pose; None before the first and after the last, because nothing is extrapolated."""
-        after = bisect_left(self._stamps_ns, stamp_ns)
-        if after == len(self._stamps_ns):
+        after = self._place(stamp_ns)
+        if after < len(self._poses) and self._poses[after][0] == stamp_ns:
+            return self._poses[after][1]
+        if not 0 < after < len(self._poses):
             return None
-        if self._stamps_ns[after] == stamp_ns:
-            return self._poses[after]
-        if after == 0:
-            return None
-        start, end = self._stamps_ns[after - 1 : after + 1]
-        a, b = self._poses[after - 1 : after + 1]
+        (start, a), (end, b) = self._poses[after - 1 : after + 1]
         return se3.interpolate(a, b, (stamp_ns - start) / (end - start))
+
+    def _place(self, stamp_ns: int) -> int:
+        return bisect_left(self._poses, stamp_ns, key=itemgetter(0))

@@ -15,7 +15,6 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages.to_msg import (
     encode,
     header,
-    heading,
     make,
     point,
     pose,
@@ -402,7 +401,7 @@ STAMPED = [f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCova
 @each("kind", [*STAMPED, "nav_msgs/msg/Odometry"])
 def test_truth_is_read_from_every_type_of_pose_or_point(tmp_path, kind):
     stamp_ns = START_S * 10**9 + 123_456_789
-    at = make("geometry_msgs/msg/Pose", position=point(1.0, 2.0, 9.0), orientation=heading(2.5))
+    at = make("geometry_msgs/msg/Pose", position=point(1.0, 2.0, 9.0), orientation=pose((1.0, 2.0, 2.5)).orientation)
     with BagWriter(tmp_path / "a.mcap") as bag:
         bag.write("/here", kind, 1, message(kind, stamp_ns, at))
     trajectory = read_truth(f"{tmp_path / 'a.mcap'}:/here").trajectory

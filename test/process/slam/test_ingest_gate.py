@@ -51,7 +51,7 @@ def driven_live(recording, folder, on_jump):
             node.trigger_configure()
             for message in open_bag(recording).messages(TOPICS):
                 name = "odom" if message.topic == "/odom" else "detections"
-                node._run.ingest.receive(node._run.ingest.converter.convert(name, message.cdr), message.cdr)
+                node._run.ingest.receive(node._run.ingest.converter.convert(name, message.cdr))
             node.finish()
         finally:
             node.destroy_node()

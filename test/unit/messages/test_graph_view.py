@@ -5,8 +5,8 @@ import pytest
 
 from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian
 from graph_slam_ros.messages import results, to_msg
-from graph_slam_ros.messages.graph_markers import graph_view
 from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.markers import graph_view
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 
 STAMP_NS = 1_700_000_000_000_000_000

@@ -116,8 +116,8 @@ def test_a_covariance_is_published_in_the_axes_of_the_parent_frame():
     assert numbers(message.pose.pose) == pose
 
 
-@each("little_endian, child", [*itertools.product([True, False], ["b", "ba", "bas", "base", "base_link"])])
-def test_the_twist_of_an_odometry_message_is_passed_on_as_it_was_received(child, little_endian):
+@each("child", ["b", "ba", "bas", "base", "base_link"])
+def test_the_twist_of_an_odometry_message_is_passed_on_as_it_was_received(child):
     for length in range(1, 9):
         twist = np.random.default_rng(length).standard_normal(42)
         covariance = np.diag([1.0, 2.0, 3.0])
@@ -125,14 +125,12 @@ def test_the_twist_of_an_odometry_message_is_passed_on_as_it_was_received(child,
         message = decode(written, results.ODOMETRY)
         assert (message.child_frame_id, numbers(message.pose.pose)[:2]) == (child, FLAT[:2])
         assert np.diag(message.pose.covariance.reshape(6, 6))[2:] == pytest.approx([1e6, 1e6, 1e6, 3.0])
-        cdr = bytes(typestore().serialize_cdr(message, results.ODOMETRY, little_endian=little_endian))
-        assert twist_of(cdr, child) == twist.tobytes()
-        assert twist_of(cdr, "wheel") is None, "what a wheel does is not what the robot does"
-        assert all(twist_of(cdr[:most], child) is None for most in range(0, len(cdr), 7)), "cut off"
-    unknown = decode(to_msg.odometry(STAMP_NS, "odom", child, FLAT, covariance, 1e6), results.ODOMETRY).twist
-    assert unknown.covariance.tolist() == (1e6 * np.eye(6)).ravel().tolist()
+        assert twist_of(message, child) == twist.tobytes()
+        assert twist_of(message, "wheel") is None, "what a wheel does is not what the robot does"
     slashed = to_msg.odometry(STAMP_NS, "odom", f"/{child}", FLAT, covariance, 1e6)
-    assert twist_of(slashed, child) == slashed[-336:]
+    message = decode(slashed, results.ODOMETRY)
+    assert message.twist.covariance.tolist() == (1e6 * np.eye(6)).ravel().tolist(), "unknown"
+    assert twist_of(message, child) == slashed[-336:]
 
 
 @each("little_endian, frame", [*itertools.product([True, False], ["map", "/map", "mapp", ""])])
