@@ -19,32 +19,33 @@ from graph_slam_ros.typing import Array, Mask
 LEAST = 10
 """Messages of odometry below which nothing is known of it."""
 
-_FASTEST_M_S, _FASTEST_RAD_S = 40.0, 12.0  # of any robot
+# In brackets: by how much less and more the findings of 255 recordings are the same, faults and robots among them.
+_FASTEST_M_S, _FASTEST_RAD_S = 40.0, 12.0  # of any robot (x 0.1, x 8), (x 0.5, x 2)
 _LEAST_S = 0.02  # of steps that are shorter, noise would pass for a turn
-_STEP, _TIMES = 0.1, 5.0  # m and rad, and times the fastest: a step that is longer is a jump
-_FEW, _FEW_JUMPS, _MANY = 0.01, 5.0, 0.1  # steps that may be jumps: a share, so many, and the most of few messages
+_STEP, _TIMES = 0.1, 5.0  # m and rad, and times the fastest: longer is a jump (x 1, x 1)
+_FEW, _FEW_JUMPS, _MANY = 0.01, 5.0, 0.1  # may be jumps: a share (x 0.5, x 2), so many (x 0.1, x 2), of few messages
 _CORRECTED = 3  # jumps: a driver that restarts, or is lifted, makes fewer
-_LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: times the fastest, and at least
-_IRREGULAR = 2.5  # spread of the times between messages, in medians; 3.2 where they come at random
+_LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # above which odometry jumps: times the fastest (x 0.1, x 2), and at least
+_IRREGULAR = 2.5  # spread of times between messages, in medians; 3.2 where they come at random
 _AT_ZERO = 1e-9  # m and rad: of a driver that was restarted
-_STILL_M, _STILL_RAD = 0.5, 1.0  # of a whole drive
-_NO_TURN_RAD, _TURNS = 1e-6, 0.2  # _TURNS: of a quaternion's numbers
-_BENDS = 0.05  # of the squares of a way, those across it
-_SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
-_WINDOW_S, _LONGEST_S = 1.0, 3.0  # over which pose and twist are compared, and with a gap
-_LEAST_WIDTH = 4  # messages in a window: between fewer, the speed may be any
-SCALE = 0.1  # of a factor: less is no other unit
-_EXPLAINED, _UNEXPLAINED = 0.5, 0.7  # of what a factor leaves: clearly explained, or clearly not
-_AT_REST = 0.05  # of the root mean square
-_LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02  # sideways by ahead; of what is left, and that
-_TINY, _USELESS, _SLOWEST_M_S = 1e-3, 3.0, 0.05  # sigmas by the fastest speed, and what that is at least
+_STILL_M, _STILL_RAD = 0.5, 1.0  # of a whole drive (x 0.1, x 8)
+_NO_TURN_RAD, _TURNS = 1e-6, 0.2  # _TURNS: of a quaternion's numbers (x 0.1, x 8)
+_BENDS = 0.05  # of the squares of a way, those across it (x 0.1, x 8)
+_SIDEWAYS = 0.2  # of the speed ahead: wheels that cannot have no such twist (x 0.5, x 2)
+_WINDOW_S, _LONGEST_S = 1.0, 3.0  # over which pose and twist are compared (x 1, x 1), and with a gap (x 0.5, x 2)
+_LEAST_WIDTH = 4  # messages in a window: between fewer, the speed may be any (0, x 2)
+SCALE = 0.1  # of a factor: less is no other unit (x 0.5, x 1)
+_EXPLAINED, _UNEXPLAINED = 0.5, 0.7  # a factor leaves: clearly explained (x 1, x 1), clearly not (x 0.1, x 1)
+_AT_REST = 0.05  # of the root mean square (x 1, x 8)
+_LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02  # sideways by ahead (x 0.1, x 2); of what is left, and that (x 0.1, x 8)
+_TINY, _USELESS, _SLOWEST_M_S = 1e-3, 3.0, 0.05  # sigmas by the fastest speed, which is at least that (x 0.1, x 8)
 _TINY_RAD_S = 1e-4  # no wheels are so good
-_OUT_OF_PLANE = 0.05  # of all poses: with more, the robot does not move in a plane
+_OUT_OF_PLANE = 0.05  # of all poses: with more, the robot does not move in a plane (x 0.1, x 8)
 TOGETHER = 5
 """Steps that are summed for a slip."""
 _ROUNDS = 10  # of reweighting
 _LEAST_STRETCHES = 20  # of fewer sums the usual scale is not known
-_ELSEWHERE_M, _OTHER_ROBOT_M = 0.3, 2.0  # poses that are not used; another driver begins where this one does
+_ELSEWHERE_M, _OTHER_ROBOT_M = 0.3, 2.0  # of poses that are not used; another driver begins where this one does
 _UNITS = {
     -1.0: "mirrored",
     57.29578: "radians for degrees",

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, OdometryColumns, TopicColumns
+from graph_slam_ros.check.columns import MOST, Columns, OdometryColumns, TopicColumns
 from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.findings.finding import Finding, Severity
 from graph_slam_ros.formats.parameters import assignment
@@ -18,7 +18,7 @@ _CLOCKS_DIFFER_S, _SET_S, EARLY_S = 10.0, 1.0, 0.15  # (x 0.3, any), (x 0.5, x 4
 MOST_LATE_S = 1.0  # of a clock that is looked for: more is seen by the times of recording
 _DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001  # part of the messages (x 0.03, x 30), (0, x 4)
 _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15  # stamps with a finer grid, or in which it stands still
-_LONG_S, _VERY_LONG_S = 1.0, 2.0  # of a gap (x 1, x 1), in which the robot moves (x 0.7, x 2)
+_LONG_S = 1.0  # of a gap (x 1, x 1), twice that where the robot moves (x 0.7, x 2)
 _PERIODS = 10.0  # of odometry (0, x 2)
 _MOVED = 0.05  # m, or of a quaternion's numbers (0, x 30)
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02  # (x 0.5, x 2), of a sighting from the nearest pose (0, x 4)
@@ -195,14 +195,14 @@ def _rate(c: Columns) -> Iterator[Finding]:
         long, moved = long[~was_set], moved[~was_set]
     if len(long):
         worst_s, often = float(step_s[long].max()), {1: "once", 2: "twice"}.get(len(long), f"{len(long)} times")
-        is_bad = bool((step_s[long][moved] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
+        is_bad = bool((step_s[long][moved] > max(_PERIODS * median_s, 2.0 * _LONG_S)).any())
         text = f"comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s {often} "
         text += f"(the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         severity: Severity = "warning" if is_bad else "note"
         yield o.finding("gap", severity, worst_s, most_s, "s", text, at=stamp_ns[long])
     if 1.0 / median_s < _SLOW_HZ:
         text = f"comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
-        severity = "warning" if _between(c, stamp_ns) > 0.5 else "note"
+        severity = "warning" if _between(c, stamp_ns) > MOST else "note"
         yield o.finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, at=stamp_ns)
 
 
