@@ -2,7 +2,10 @@
 
 from types import SimpleNamespace
 
+import pytest
 from rows import each
+
+pytest.importorskip("rclpy")
 
 from graph_slam_ros.node.subscriptions import alternatives
 from graph_slam_ros.slam import Config

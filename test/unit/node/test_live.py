@@ -1,4 +1,4 @@
-"""Parts of the running node that need no ROS: what is told of map -> odom, who is ahead, how it is judged."""
+"""Parts of the running node, without a graph: what is told of map -> odom, who is ahead, how it is judged."""
 
 import itertools
 import math
@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from messages import STAMP_NS
 from rows import each
+
+pytest.importorskip("tf2_msgs")
 
 from graph_slam_ros.findings.finding import Finding
 from graph_slam_ros.lie import se2, so3

@@ -1,5 +1,9 @@
 """Lost messages are counted by their numbers, and none that was not lost."""
 
+import pytest
+
+pytest.importorskip("rclpy")
+
 from graph_slam_ros.node.subscriptions import Losses
 
 ONE, OTHER, BOTH = frozenset({b"1"}), frozenset({b"2"}), frozenset({b"1", b"2"})
