@@ -15,24 +15,6 @@ TRUE_NOISE = {"odometry.twist_correlation_s": 1.0}  # of the simulated wheels: e
 SLIPPING = 1.4  # turns of wheels for each turn of the robot
 
 
-def stood(recording, seconds):
-    """The same drive after some time at rest."""
-    count = round(seconds / TICK_S)
-
-    def longer(rows, first=None):
-        return np.concatenate([np.repeat(rows[:1] if first is None else first, count, axis=0), rows])
-
-    return replace(
-        recording,
-        stamps_ns=recording.stamps_ns[0] + TICK_NS * np.arange(len(recording.stamps_ns) + count),
-        T_odom_base=longer(recording.T_odom_base),
-        twist=longer(recording.twist),
-        odom_covariance=longer(recording.odom_covariance),
-        T_world_base=longer(recording.T_world_base),
-        seen=tuple(replace(s, stamp_ns=s.stamp_ns + count * TICK_NS) for s in recording.seen),
-    )
-
-
 def with_wrong_wheels(recording, factor=1.0, *, slips=False):
     """Wheels that turn by a factor more than the robot, or slip in every other turn."""
     twist = recording.twist.copy()
@@ -46,8 +28,8 @@ def with_wrong_wheels(recording, factor=1.0, *, slips=False):
 
 def drive(seed, *, rest_s=0.0, bias=0.0, every=20, factor=1.0, slips=False, walk=2e-5, **options):
     """What a robot with a gyro measures, in order of stamp, and its recording; few tags are seen."""
-    world = simulate("warehouse", seed, sensor="position", **options)
-    recording = stood(with_wrong_wheels(world, factor, slips=slips), rest_s)
+    world = simulate("warehouse", seed, sensor="position", rest_s=rest_s, **options)
+    recording = with_wrong_wheels(world, factor, slips=slips)
     recording = with_instruments(recording, seed, imu=100.0, imu_bias_rad_s=bias, imu_bias_walk=walk)
     out = [
         replace(m, source="odom") if isinstance(m, Odometry) else m

@@ -8,7 +8,7 @@ from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.evaluate import suggest_next
 from graph_slam_ros.errors import GraphSlamError
 
-_FILES = ("tum", "g2o", "mcap")
+_FILES = ("tum", "g2o", "geojson", "mcap")
 _PICTURES = ("png", "gif")
 
 
@@ -131,7 +131,7 @@ def export_options(sub: arguments.CommandParser) -> None:
     arguments.add_run(sub)
     about = (
         "output file; its ending says what: .tum the path; .g2o the graph, with stamps and names in a second file;"
-        " .mcap both as ROS messages; .png a picture; .gif the drive and its correction"
+        " .geojson path and landmarks on earth; .mcap both as ROS messages; .png a picture; .gif the drive corrected"
     )
     sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
     sub.add_argument("--last-drive", action="store_true", help="tum: only the last drive, not those of the loaded map")
@@ -159,6 +159,7 @@ def export(args: argparse.Namespace) -> int:
     use = {
         "tum": f"evo_traj tum {args.out} --plot, or any reader of TUM trajectories",
         "g2o": console.command("optimize", args.out),
+        "geojson": f"open {args.out} in QGIS, or drop it on geojson.io",
         "mcap": f"open {args.out} in Foxglove, or ros2 bag play {args.out}",
     }
     console.then(use[target])

@@ -148,15 +148,17 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     common = shared_landmarks(one, two)
     at = _of_one_stamp(WholePath.of(one, a), WholePath.of(two, b))
     aligned, by, T_a_b = _aligned(one, two, common, at)
-    apart = _keyframe_distances(one, at, T_a_b)
+    in_a, in_b = (poses[:, : one.space.dimensions] for poses in at)
+    apart = np.linalg.norm(np.stack(one.space.group.act(T_a_b, tuple(in_b.T)), axis=-1) - in_a, axis=1)
     known = [set(view.landmarks) for view in (one, two)]
     edges, verdicts = _edges(one, two)
+    chi2 = [view.report.chi2_final if view.report else math.nan for view in (one, two)]
     moved = [MovedLandmark(name, *aligned.distance(k)) for k, name in enumerate(common)]
     return Difference(
         Counts(len(one.keyframes), len(two.keyframes), len(apart)),
         Counts(len(known[0]), len(known[1]), len(known[0] & known[1])),
         edges,
-        (_chi2(one), _chi2(two)),
+        (chi2[0], chi2[1]),
         by,
         T_a_b,
         (float(np.median(apart)), float(apart.max())) if len(apart) else (math.nan, math.nan),
@@ -198,17 +200,6 @@ def _by_stamp(stamps_ns: Index) -> dict[tuple[int, int], int]:
         out[stamp, times[stamp]] = k
         times[stamp] += 1
     return out
-
-
-def _keyframe_distances(one: MapView, at: tuple[Array, Array], T_a_b: Numbers) -> Array:
-    a, b = at
-    n = one.space.dimensions
-    moved = np.stack(one.space.group.act(T_a_b, tuple(b[:, :n].T)), axis=-1).reshape(-1, n)
-    return np.linalg.norm(moved - a[:, :n], axis=1)
-
-
-def _chi2(view: MapView) -> float:
-    return view.report.chi2_final if view.report else math.nan
 
 
 # -- edges -------------------------------------------------------------------------------------------------------------

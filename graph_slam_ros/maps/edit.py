@@ -134,13 +134,13 @@ def source_hash(folder: Path) -> str:
     return f"sha256:{digest.hexdigest()}"
 
 
+def _content(plan: Plan) -> dict[str, Any]:
+    return {"format": FORMAT, "version": VERSION, "source": plan.source, "edits": [e.values for e in plan.edits]}
+
+
 def plan_text(plan: Plan) -> str:
     """A plan as JSON."""
     return json.dumps(_content(plan), indent=2, ensure_ascii=False) + "\n"
-
-
-def _content(plan: Plan) -> dict[str, Any]:
-    return {"format": FORMAT, "version": VERSION, "source": plan.source, "edits": [e.values for e in plan.edits]}
 
 
 def write_empty_plan(folder: Path, file: Path) -> None:
@@ -154,14 +154,12 @@ def read_plan(file: Path) -> Plan:
     """Read a plan. Raises FormatError: it is not a plan; the text names the edit and the key."""
     try:
         if file.stat().st_size > _MOST_BYTES:
-            raise FormatError(f"{file}: larger than {_MOST_BYTES} bytes: not read")
-        text = read_text(file)
+            raise FormatError(f"larger than {_MOST_BYTES} bytes: not read")
+        return plan_of(read_text(file))
     except OSError as error:
         raise FormatError(f"{file}: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise FormatError(f"{file}: not JSON: {error}") from None
-    try:
-        return plan_of(text)
     except FormatError as error:
         raise FormatError(f"{file}: {error}") from None
 

@@ -1,9 +1,11 @@
-"""Export of a run to other formats: its path as TUM, its graph as g2o, both as mcap for viewers.
+"""Export of a run to other formats: its path as TUM or GeoJSON, its graph as g2o, both as mcap for viewers.
 
 Everything is read from the map of the run. So a run that never ended can be exported, too.
 """
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +14,14 @@ from graph_slam_ros.formats.g2o_writer import write_g2o, write_text
 from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results, to_msg
+from graph_slam_ros.messages.inputs.fixes import geodetic
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import RunError, is_run
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.tables import graph_file, numbered
 from graph_slam_ros.slam import MapView
+from graph_slam_ros.typing import Array
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
@@ -66,6 +70,25 @@ def _g2o(view: MapView, whole: WholePath, out: Path) -> list[Path]:
     return [out, names_file]
 
 
+def _geojson(view: MapView, whole: WholePath, out: Path) -> list[Path]:
+    """The path as a line, and landmarks as points: longitude and latitude (WGS 84), in space with the height."""
+    if not view.datum:
+        raise RunError(f"{out}: nothing says where on earth this map is: no NavSatFix of the recording was used")
+    n = view.space.dimensions
+
+    def feature(kind: str, points: Array, **properties: Any) -> dict[str, Any]:
+        at = geodetic(np.pad(points, ((0, 0), (0, 3 - n))), view.datum)[:, [1, 0, 2][:n]].tolist()
+        shape = {"type": kind, "coordinates": at if kind == "LineString" else at[0]}
+        return {"type": "Feature", "geometry": shape, "properties": properties}
+
+    stamps_s = (whole.stamps_ns / 1e9).tolist()
+    features = [feature("LineString", whole.poses()[:, :n], name="path", stamps_s=stamps_s)]
+    for name, landmark in view.landmarks.items():
+        features.append(feature("Point", view.solver.estimate([landmark.vertex])[:, :n], name=name))
+    write_text(out, json.dumps({"type": "FeatureCollection", "features": features}))
+    return [out]
+
+
 def _mcap(view: MapView, whole: WholePath, out: Path) -> list[Path]:
     """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks.
 
@@ -86,4 +109,4 @@ def _mcap(view: MapView, whole: WholePath, out: Path) -> list[Path]:
     return [out]
 
 
-TARGETS = {"tum": _tum, "g2o": _g2o, "mcap": _mcap}
+TARGETS = {"tum": _tum, "g2o": _g2o, "geojson": _geojson, "mcap": _mcap}

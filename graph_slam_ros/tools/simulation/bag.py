@@ -79,15 +79,17 @@ def imu_messages(imu: Imu | None) -> Iterator[Message]:
 
 
 def _mounted(stamp_ns: int, frame: str, T_base_frame: Numbers) -> Message:
-    return "/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, transform(stamp_ns, "base_link", frame, T_base_frame)
+    return "/tf_static", _TRANSFORMS, stamp_ns, transform(stamp_ns, "base_link", frame, T_base_frame)
 
 
 ODOMETRY_TOPIC = "/odom"
 TRUTH_TOPIC = "/ground_truth"
 TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _DETECTIONS = "vision_msgs/msg/Detection3DArray"
 _POINTS = "sensor_msgs/msg/PointCloud2"
-_SENSOR = "sensor"
+_SENSOR, _CAMERA = "sensor", "camera_optical_frame"
+_T_BASE_CAMERA = se3.from_xyz_rpy((0.2, 0.0, 0.4, -0.5 * np.pi, 0.0, -0.5 * np.pi))  # it looks ahead
 _UNUSED = 1e6  # variance of what is not measured: z, roll, pitch of a planar robot, the rotation of a point
 _SURVEYED_M = 1e-3  # truth has no error; a covariance of zero would mean unknown
 
@@ -103,6 +105,8 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     ``elevation``, ``sigma`` and ``sigma_bearing``, as far as they are measured, in the frame ``sensor`` of
     ``/tf_static``. A field holds no name: landmarks then go by their numbers, in the truth, too.
 
+    Tags of ``apriltag`` are transforms on ``/tf`` from ``camera_optical_frame`` to ``tag36h11:7`` and so on.
+
     A satellite receiver is on ``/gps/fix`` (NavSatFix, frame ``gps``), an IMU on ``/imu/data`` (Imu, ``imu_link``).
 
     Raises
@@ -112,6 +116,8 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     """
     if _is_polar(recording) and len(_kinds(recording)) > 1:
         raise GraphSlamError(f"no message holds {' and '.join(sorted(_kinds(recording)))} together")
+    if recording.apriltag and _kinds(recording) != {"pose"}:
+        raise GraphSlamError("apriltag: it publishes poses of tags: a world with sensor=pose")
     streams = [
         _mounted_sensor(recording),
         gnss_messages(recording.gnss),
@@ -129,8 +135,9 @@ def write_bag(recording: Recording, path: Path | str) -> None:
 
 def recorded_names(recording: Recording) -> dict[str, str]:
     """Return the name of each landmark in a bag: its id, or a number if the messages have no names."""
-    polar = _is_polar(recording)
-    return {name: str(k) if polar else name for k, name in enumerate(recording.landmarks)}
+    if not (recording.apriltag or _is_polar(recording)):
+        return {name: name for name in recording.landmarks}
+    return {name: f"{'tag36h11:' * recording.apriltag}{k}" for k, name in enumerate(recording.landmarks)}
 
 
 def _kinds(recording: Recording) -> set[str]:
@@ -142,6 +149,8 @@ def _is_polar(recording: Recording) -> bool:
 
 
 def _mounted_sensor(recording: Recording) -> Iterator[Message]:
+    if recording.apriltag:
+        yield _mounted(int(recording.stamps_ns[0]), _CAMERA, _T_BASE_CAMERA)
     if _is_polar(recording):
         T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings)
         at = T_base_sensor or space_of(recording.T_world_base[0]).identity
@@ -175,8 +184,13 @@ def _true_landmarks(recording: Recording) -> Iterator[Message]:
 
 def _landmarks(recording: Recording) -> Iterator[Message]:
     space, names, is_polar = space_of(recording.T_world_base[0]), recorded_names(recording), _is_polar(recording)
+    to_camera = se3.inverse(_T_BASE_CAMERA)
     for one in recording.seen:
-        if is_polar:
+        if recording.apriltag:
+            for tag in one.sightings:
+                at = se3.compose(to_camera, tuple(se3.in_space(tag.measured).tolist()))
+                yield "/tf", _TRANSFORMS, one.stamp_ns, transform(one.stamp_ns, _CAMERA, names[tag.id], at)
+        elif is_polar:
             yield LANDMARKS_TOPIC, _POINTS, one.stamp_ns, _point_cloud(one, names)
         else:
             yield _detections(LANDMARKS_TOPIC, one.stamp_ns, "base_link", one.sightings, space)

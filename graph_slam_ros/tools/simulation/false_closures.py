@@ -96,14 +96,14 @@ def _anywhere(rng: Generator, truth: Array, _root: Array, pairs: int) -> tuple[I
     last = len(truth) - pairs
     a, b = rng.integers(0, last + 1, size=2).tolist()
     earlier, later = _distant_pair(min(a, b), max(a, b), last)
-    return _following(earlier, later, pairs), _same(rng, space_of(truth[0]), pairs)
+    return _following(earlier, later, pairs), np.tile(_near_identity(rng, space_of(truth[0])), (pairs, 1))
 
 
 def _local(rng: Generator, truth: Array, _root: Array, pairs: int) -> tuple[Index, Array]:
     last = len(truth) - pairs
     earlier = int(rng.integers(0, last - 1))
     later = int(rng.integers(earlier + 2, min(last, earlier + LOCAL_POSES) + 1))
-    return _following(earlier, later, pairs), _same(rng, space_of(truth[0]), pairs)
+    return _following(earlier, later, pairs), np.tile(_near_identity(rng, space_of(truth[0])), (pairs, 1))
 
 
 def _aliased(rng: Generator, truth: Array, root: Array, pairs: int) -> tuple[Index, Array]:
@@ -137,10 +137,6 @@ def _distant_pair(earlier: int, later: int, last: int) -> tuple[int, int]:
 
 def _following(earlier: int, later: int, pairs: int) -> Index:
     return np.array([earlier, later]) + np.arange(pairs)[:, None]
-
-
-def _same(rng: Generator, space: Geometry, pairs: int) -> Array:
-    return np.tile(_near_identity(rng, space), (pairs, 1))
 
 
 def _near_identity(rng: Generator, space: Geometry) -> Array:

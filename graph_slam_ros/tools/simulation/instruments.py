@@ -10,10 +10,10 @@ import numpy as np
 from numpy.random import Generator
 
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.messages.inputs.fixes import east_north_up
+from graph_slam_ros.messages.inputs.fixes import geodetic
 from graph_slam_ros.tools.simulation.options import checked, option, random
 from graph_slam_ros.tools.simulation.recording import Gnss, Imu, Recording, Stamps, VelocityNoise
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array
 
 DATUM = (47.4, 8.55, 440.0)  # latitude [deg], longitude [deg], height above the ellipsoid [m] of the world's origin
 ANTENNA_M = (0.3, 0.1, 0.8)  # in base_link
@@ -22,8 +22,6 @@ UP = 2.0  # a fix is so many times worse upwards
 SIGMA_RAD, CORRELATION_S = 0.02, 5.0  # of the orientation of the IMU, and how long such an error lasts (1/e)
 SIGMA_RATE_RAD_S, SIGMA_ACCELERATION_M_S2 = 0.002, 0.02
 GRAVITY_M_S2 = 9.81
-EARTH_M = 6.37e6  # its radius, nearly
-_STEPS = 6
 _STREAM = 1  # of the seed: the drive is the same with and without instruments
 
 
@@ -31,7 +29,9 @@ _STREAM = 1  # of the seed: the drive is the same with and without instruments
 def with_instruments(
     recording: Recording,
     seed: int,
+    rest_s: float = option(0.0, "the robot stands so long before it moves", "s", 0, 1e4),
     landmarks: bool = option(True, "whether the robot sees landmarks at all"),
+    apriltag: bool = option(False, "tags are published as apriltag_ros does: on /tf, below the frame of a camera"),
     gnss: float = option(0.0, "fixes of a satellite receiver, on /gps/fix; 0: there is none", "Hz", 0, 100),
     gnss_sigma_m: float = option(0.3, "error of a fix east and north; twice that upwards", "m", 1e-3, 100),
     gnss_correlation_s: float = option(2.0, "how long such an error lasts (1/e)", "s", 0, 1e4),
@@ -42,7 +42,8 @@ def with_instruments(
     imu_bias_walk: float = option(0.0, "random walk of that", "rad/s/sqrt(s)", 0, 1),
 ) -> Recording:
     """A satellite receiver and an IMU are added; or landmarks are left out."""
-    added: dict[str, Any] = {} if landmarks else {"seen": ()}
+    recording = _stood(recording, rest_s) if rest_s else recording
+    added: dict[str, Any] = {"apriltag": apriltag} if landmarks else {"seen": ()}
     if gnss > 0.0:
         sigmas = gnss_sigma_m * np.array([1.0, 1.0, UP])
         noise = VelocityNoise(tuple(sigmas.tolist()), gnss_correlation_s)
@@ -52,6 +53,21 @@ def with_instruments(
         steps = imu_bias_walk * np.sqrt(1.0 / imu) * random(seed, _STREAM, 2).standard_normal(measured.rate.shape)
         added["imu"] = replace(measured, rate=measured.rate + imu_bias_rad_s + np.cumsum(steps, axis=0))
     return replace(recording, **added)
+
+
+def _stood(recording: Recording, rest_s: float) -> Recording:
+    """The same drive after some time at rest."""
+    first_ns, second_ns = recording.stamps_ns[:2].tolist()
+    count = round(rest_s * 1e9 / (second_ns - first_ns))
+    names = ("T_odom_base", "twist", "odom_covariance", "T_world_base")
+    kept = {name: getattr(recording, name) for name in names}
+    longer: dict[str, Any] = {k: np.concatenate([np.repeat(rows[:1], count, axis=0), rows]) for k, rows in kept.items()}
+    return replace(
+        recording,
+        stamps_ns=first_ns + (second_ns - first_ns) * np.arange(len(recording.stamps_ns) + count),
+        seen=tuple(replace(one, stamp_ns=one.stamp_ns + count * (second_ns - first_ns)) for one in recording.seen),
+        **longer,
+    )
 
 
 def _gnss(rng: Generator, recording: Recording, rate_hz: float, noise: VelocityNoise, outage_s: float) -> Gnss:
@@ -101,17 +117,3 @@ def _true_poses(recording: Recording, rate_hz: float) -> tuple[Stamps, Array]:
     poses = se3.in_space(recording.T_world_base)
     between = se3.interpolate(tuple(poses[before].T), tuple(poses[before + 1].T), fraction)
     return stamps_ns, np.stack(between, axis=1)
-
-
-def geodetic(points: Array, datum: Numbers) -> Array:
-    """Latitude [deg], longitude [deg] and height [m] of points (n, 3) east, north and up of a datum.
-
-    Newton's method on ``east_north_up``, whose derivative is nearly that of a sphere.
-    """
-    degree_m = np.array([np.deg2rad(EARTH_M), np.deg2rad(EARTH_M) * np.cos(np.deg2rad(datum[0])), 1.0])
-    out = np.tile(np.array(datum), (len(points), 1))
-    for row, point in zip(out, points, strict=True):
-        for _ in range(_STEPS):
-            missing = point - east_north_up((float(row[0]), float(row[1]), float(row[2])), datum)
-            row += missing[[1, 0, 2]] / degree_m
-    return out

@@ -169,6 +169,7 @@ class Recording:
     landmarks : true poses in world by id; of points the position alone
     closures : in order of their later stamp; both are stamps of odometry
     gnss, imu : None where the robot has none
+    apriltag : whether tags are recorded as apriltag_ros publishes them
     """
 
     stamps_ns: Stamps
@@ -182,6 +183,7 @@ class Recording:
     closures: tuple[Closure, ...] = ()
     gnss: Gnss | None = None
     imu: Imu | None = None
+    apriltag: bool = False
 
 
 def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:

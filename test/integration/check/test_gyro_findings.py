@@ -1,7 +1,6 @@
 """A gyro that is wrong is found against odometry, and the setting that is printed mends it."""
 
 import pytest
-from gyroscopes import stood
 from reliability import times
 
 from graph_slam_ros.formats.parameters import parse_setting
@@ -59,8 +58,7 @@ def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, f
 def laps(tmp_path_factory):
     """Long enough for landmarks to decide whether the gyro or odometry is wrong; first the robot stands."""
     file = tmp_path_factory.mktemp("gyro") / "laps.mcap"
-    recording = stood(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), 2.0)
-    write_bag(with_instruments(recording, 3, imu=50.0), file)
+    write_bag(simulate("warehouse", 3, rest_s=2.0, imu=50.0, aisles=2, aisle_m=6.0, laps=2), file)
     return file
 
 

@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from gyroscopes import GYRO, drive, driven, errors, stood
+from gyroscopes import GYRO, drive, driven, errors
 from reliability import tell, times
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.slam import AngularVelocity
-from graph_slam_ros.tools.simulation import simulate, with_instruments
+from graph_slam_ros.tools.simulation import simulate
 from graph_slam_ros.tools.simulation.bag import write_bag
 
 SEEDS = times(1, 20)
@@ -60,8 +60,8 @@ def test_the_order_of_arrival_changes_nothing_and_a_silent_gyro_leaves_wheels_as
 def bag(tmp_path_factory):
     """A short drive after a rest, with an IMU of bias 0.01 rad/s."""
     path = tmp_path_factory.mktemp("gyro") / "drive.mcap"
-    recording = stood(simulate("warehouse", 3, aisles=2, laps=1, aisle_m=4.0), 2.0)
-    write_bag(with_instruments(recording, 3, imu=100.0, imu_bias_rad_s=0.01), path)
+    small = {"aisles": 2, "laps": 1, "aisle_m": 4.0}
+    write_bag(simulate("warehouse", 3, rest_s=2.0, imu=100.0, imu_bias_rad_s=0.01, **small), path)
     return path
 
 
