@@ -184,18 +184,28 @@ class OutlierGate:
                     return True
         return False
 
-    def readmit_likely_group(self, keyframe: int, costs: Mapping[int, float] | None = None) -> list[int]:
-        """Accept those of the rejected edges that fit best of which each is likely given the others, though not alone.
+    def readmit_group(self, keyframe: int, costs: Mapping[int, float]) -> list[int]:
+        """Accept, as a trial, the rejected edges that may be likely together. Returns them: none, or at least two.
 
-        Their costs follow from their joint covariance, so nothing is solved for edges that stay out.
+        A group costs at least what each of its edges costs alone. So one that costs more than all their gates together
+        is in no such group.
 
         Parameters
         ----------
-        costs : innovations of those that fit best, by edge, where they are known
+        costs : innovations, by edge
         """
-        if costs is None:
-            nearest = self._nearest(_RETESTS)
-            costs = dict(zip(nearest, self.innovations(nearest), strict=True))
+        group = self._affordable(costs)
+        for edge in group:
+            self._readmit(edge, keyframe, costs[edge])
+        return group
+
+    def readmit_likely_group(self, keyframe: int) -> list[int]:
+        """Accept those of the rejected edges that fit best of which each is likely given the others, though not alone.
+
+        Their costs follow from their joint covariance, so nothing is solved for edges that stay out.
+        """
+        nearest = self._nearest(_RETESTS)
+        costs = dict(zip(nearest, self.innovations(nearest), strict=True))
         group = likely_together(self._graph, self._solver, self._affordable(costs), self.most_cost, ENOUGH)
         for edge in group:
             self._readmit(edge, keyframe, costs[edge])

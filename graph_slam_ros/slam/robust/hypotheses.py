@@ -7,7 +7,7 @@ is judged by its residual, until no verdict changes. A rejected candidate costs 
 squares).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import GROUPS, Graph
+from graph_slam_ros.graph import GROUPS, Graph, Loss
 from graph_slam_ros.slam.background import CancelToken
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
@@ -33,6 +33,7 @@ _ITERATIONS = 20  # of each stage of the losses, from another start
 _ROUNDS = 10  # of a search at most: solve everything, then review all verdicts
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
+_NEAR = 1e-3  # m or rad: what two solves of one optimum differ by at most
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -113,6 +114,21 @@ def moved_rigidly(graph: Graph, values: Array, T_new_old: Numbers) -> Array:
     return out
 
 
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """The result of the first solve of a start: accepted edges, stored numbers of all vertices, truncated cost."""
+
+    inside: Index
+    values: Array
+    cost: float
+
+    def joins(self, other: "_Way") -> bool:
+        """Return whether another start has come to the same place, up to what solves end off the optimum."""
+        if not (np.array_equal(self.inside, other.inside) and abs(self.cost - other.cost) <= _SAME * other.cost):
+            return False
+        return bool(np.abs(self.values - other.values).max() <= _NEAR)
+
+
 def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
     """Explain a graph anew from each start; the lowest cost wins. None if nothing can be solved, or if cancelled."""
     search = _Search(config, frozen)
@@ -162,6 +178,7 @@ class _Search:
         limits = frozen.ledger.threshold.values[frozen.ledger.ids.rows(self._candidates)]
         self._jumps = jumps_and_back(self._graph, self._odometry, self._candidates, limits)
         self.found = list[Outcome]()
+        self._ways = list[_Way]()
 
     @property
     def explains_everything(self) -> bool:
@@ -196,7 +213,10 @@ class _Search:
             yield "rejected", odometry, np.concatenate((others, largest))
 
     def explain_from(self, name: str, start: Array, inliers: Index | None) -> None:
-        """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates."""
+        """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
+
+        Nothing is found if it comes to where another start has come: what follows is the same.
+        """
         frozen, mine = self._frozen, self._frozen.ledger.copy()
         decisions = self._gate(start, mine)
         hopeless = _HOPELESS * min((one.cost for one in self.found), default=np.inf)
@@ -205,6 +225,10 @@ class _Search:
             decisions.force_inliers(inliers, frozen.keyframe)
             solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
             decisions.reclassify(frozen.keyframe)
+            here = _Way(mine.inside, solver.values, self._cost(mine))
+            if any(here.joins(one) for one in self._ways):
+                return
+            self._ways.append(here)
         if inliers is None or self._cost(mine) <= 2.0 * hopeless:
             self._alternate(decisions, hopeless)
         judged = mine.candidates
@@ -242,11 +266,8 @@ class _Search:
             if _is_known(self._cost(mine), mine, self.found):
                 return
             costs = dict[int, float]()
-            if not decisions.readmit_next(keyframe, costs):
-                group = decisions.readmit_likely_group(keyframe, costs)
-                if not group:
-                    return
-                decisions.make_fit(group, keyframe)
+            if not (decisions.readmit_next(keyframe, costs) or _together(decisions, solver, self._frozen, costs)):
+                return
 
     def _cost(self, ledger: Ledger) -> float:
         """Chi2 of all accepted edges; a candidate costs at most its threshold, and those of one jump that once."""
@@ -257,6 +278,29 @@ class _Search:
         out = np.where(np.isin(outside, jumped), ledger.numbers.values[rows_out], limits[rows_out])
         doubted = float(np.minimum(chi2, limits[rows]).sum() + out.sum())
         return self._solver.evaluate().chi2_final - float(chi2.sum()) + doubted
+
+
+def _together(decisions: OutlierGate, solver: Solver, frozen: FrozenGraph, costs: Mapping[int, float]) -> bool:
+    """Accept rejected edges that support one another: they fit, and cost together no more than a gate for each.
+
+    Alone each of them may be too unlikely, because the map was solved without the others.
+
+    Parameters
+    ----------
+    costs : innovations of the edges that fit best
+    """
+    before, chi2 = solver.values, solver.evaluate().chi2_final
+    group = decisions.readmit_group(frozen.keyframe, costs)
+    if not group:
+        return False
+    full = {key: [Loss(), stages[-1]] for key, stages in frozen.settings.losses.items()}
+    solver.optimize(replace(frozen.settings, losses=full, max_iterations=_ITERATIONS))
+    rise = solver.evaluate().chi2_final - chi2
+    if not decisions.unfit(group) and rise <= decisions.most_cost(group):
+        return True
+    decisions.exchange((), group, frozen.keyframe)
+    solver.start_at(before)
+    return False
 
 
 def _is_known(cost: float, ledger: Ledger, found: Sequence[Outcome]) -> bool:
