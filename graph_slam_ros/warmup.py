@@ -55,7 +55,7 @@ class Compiling:
         done = min(self.done, _KERNELS - 1)
         new = done - self.began_with
         left_s = self.elapsed_s * (_KERNELS - done) / new if new > 0 else 0.0
-        left = "" if not left_s else f", about {10 * math.ceil(left_s / 10)} s more"
+        left = f", about {10 * math.ceil(left_s / 10)} s more" if left_s else ""
         why = f" (the wheel's are not for Numba {numba.__version__} on this processor)" if ARCHIVES else ""
         return f"compiling kernels, once per installation{why}: {100 * done / _KERNELS:.0f} %{left}"
 
@@ -184,8 +184,7 @@ def _load_edges(*, in_space: bool) -> None:
         SE2.retract(np.zeros((1, 3)), np.zeros((1, 3)))
 
 
-# Kernels that take most of the time, and those that are needed after a failure, perhaps without memory to load them.
-# Two parts call the first
+# Two parts call the first. The others take most of the time, or are needed after a failure, perhaps without memory.
 _TWICE = (
     *(storage.ascending, storage.chosen, storage.in_order, storage.joined, storage.lengthened),
     *(incremental.mark, numeric.accept_steps),
@@ -202,6 +201,7 @@ def _compile_structure() -> None:
     _make(*_TWICE)
     (CACHE_DIR / _SHARED).touch()
     _make(*_STRUCTURE)
+    adjoints_of_inverses(PLANAR, np.zeros((1, 3)))  # no other part has them
     _wait_for("complete-plane")
     _load_plane()
 

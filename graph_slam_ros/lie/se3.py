@@ -171,19 +171,19 @@ def local(a: Pose, b: Pose) -> Tangent:
 def interpolate(a: Pose, b: Pose, fraction: Any) -> Pose:
     """Pose on the geodesic from a (fraction 0) to b (fraction 1)."""
     v = local(b, a)
-    return retract(
-        a, (fraction * v[0], fraction * v[1], fraction * v[2], fraction * v[3], fraction * v[4], fraction * v[5])
-    )
+    part = (fraction * v[0], fraction * v[1], fraction * v[2], fraction * v[3], fraction * v[4], fraction * v[5])
+    return retract(a, part)
 
 
 @jitable
 def adjoint(a: Pose) -> Array:
     """Adjoint matrix (6, 6) of one pose, eq. (175): ``a Exp(d) = Exp(Ad d) a``."""
-    turn = so3.matrix(rotation(a))
-    out = np.zeros((6, 6))
-    out[:3, :3] = turn
-    out[:3, 3:] = so3.hat(position(a)) @ turn
-    out[3:, 3:] = turn
+    turn, out = so3.matrix(rotation(a)), np.zeros((6, 6))
+    swept = so3.hat(position(a)) @ turn
+    for i in range(3):  # a part of an array that is assigned takes 2 s to compile, for its error message
+        for j in range(3):
+            out[i, j] = out[3 + i, 3 + j] = turn[i, j]
+            out[i, 3 + j] = swept[i, j]
     return out
 
 
