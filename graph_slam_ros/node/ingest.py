@@ -182,10 +182,10 @@ class Ingest:
 
     def _publish_outcome(self, text: str, *, is_done: bool) -> None:
         """Log what became of it; say it on ~/events and, as the last, on /diagnostics: a topic has no answer."""
-        self.outcome = events.happened("asked", text, OK if is_done else WARN)
+        self.outcome = outcome = events.happened("asked", text, OK if is_done else WARN)  # two threads come here
         if not is_done:
             self._node.get_logger().warn(text)
-        self._run.publishers.publish_events(self._node.now_ns, [self.outcome])
+        self._run.publishers.publish_events(self._node.now_ns, [outcome])
 
     # -- time --------------------------------------------------------------------------------------------------------
 
