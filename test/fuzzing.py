@@ -1,8 +1,7 @@
 """Mutated files through the readers: each gives data or one of our errors, in 5 s of CPU time and 512 MiB.
 
-``python test/fuzzing.py COUNT SEED FORMAT ...`` prints what came of it; it ends with 1 where a file did something else:
-that file is kept under ``GRAPH_SLAM_FAULTS``, if that is set. Half of the mutations of mcap files are made before the
-chunks are compressed and summed up, or checksums would keep them from ever being parsed.
+``python test/fuzzing.py COUNT SEED FORMAT ...`` ends with 1 where a file did something else: it is kept under
+``GRAPH_SLAM_FAULTS``. Half of the mutations of mcap files are made before chunks are compressed and summed up.
 """
 
 import os

@@ -1,11 +1,8 @@
 """A drive with 12 wrong loop closures, of which 4 agree with one another and are believed.
 
-The robot drives four aisles that look alike. Four times it takes the fourth for the second. These closures agree with
-one another, and odometry is too inaccurate to contradict them. At the end there are true closures with the first
-aisle, which they contradict. Eight other wrong closures join any two places.
-
-``PYTHONPATH=test python test/planted_closures.py FOLDER`` writes the runs FOLDER/run and FOLDER/clean (without the 12),
-the truth FOLDER/truth.tum and the ids of the wrong edges, FOLDER/wrong.csv.
+The robot takes the fourth of four aisles for the second four times, and only true closures with the first contradict.
+``PYTHONPATH=test python test/planted_closures.py FOLDER`` writes FOLDER/run, clean (without the 12), truth.tum and
+wrong.csv, the ids of the wrong edges.
 """
 
 import sys

@@ -60,10 +60,11 @@ def draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool =
         console.show(f"picture in {picture}")
 
 
-def suggest_next(run: Path, doubtful: Path | None = None) -> None:
-    """Name the next command; ``doubtful`` is a recording whose result is incomplete, or comes with a warning."""
+def suggest_next(run: Path, doubtful: Path | None = None, *same: str) -> None:
+    """Name the next command. ``doubtful``: a recording with a warning, or incomplete; ``same``: its options."""
     if doubtful is not None:
-        return console.then(f"{console.command('check', doubtful)} (what is wrong with the recording, and the remedy)")
+        what = f"{console.command('check', doubtful, *same)} (what is wrong with the recording, and the remedy)"
+        return console.then(what)
     if importlib.util.find_spec("plotly") is None:
         what = f"{console.command('explain', run)} (which measurements are believed, and why)"
     else:

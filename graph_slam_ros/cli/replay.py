@@ -34,7 +34,7 @@ def replay(args: argparse.Namespace) -> int:
     from graph_slam_ros.slam import Config
 
     _refuse_idle_options(args, is_run(args.bag))
-    config = _with_suggestion(args, config_of(args))
+    config = config_of(args) if is_run(args.bag) else _with_suggestion(args, config_of(args))
     if args.ros:
         return _replay_live(args, config)
     if args.out is None:
@@ -56,19 +56,18 @@ def replay(args: argparse.Namespace) -> int:
     draw(args.out)
     code = console.report_losses(done.losses, done.warnings) or code
     said = not code and not done.summary.get("check", {}).get("settings", True)  # check would say no more
-    suggest_next(args.out, None if is_run(args.bag) or said or not (code or done.warnings) else args.bag)
+    same = [word for text in args.set for word in ("--set", text)] + ["--config", str(args.config)] * bool(args.config)
+    suggest_next(args.out, None if is_run(args.bag) or said or not (code or done.warnings) else args.bag, *same)
     return code
 
 
 def _with_suggestion(args: argparse.Namespace, config: "Config") -> "Config":
     """The configuration, with inputs that ``info`` suggests where a recording has no usual odometry or landmarks."""
-    from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.runs.suggestion import suggestion_for_other_types
 
-    if args.config or args.landmarks or args.map or (args.ros and args.out is None) or is_run(args.bag):
+    if args.config or args.landmarks or args.map or (args.ros and args.out is None):
         return config
-    found = suggestion_for_other_types(args.bag, config, args.odom)
-    if found is None:
+    if (found := suggestion_for_other_types(args.bag, config, args.odom)) is None:
         return config
     args.odom, args.landmarks = args.odom or found.topics.get("odom"), found.topics.get("detections")
     what = "is no odometry" if "odom.type" in found.settings else "are no landmarks"

@@ -313,7 +313,8 @@ def _of_sightings(summary: Summary) -> Iterator[Finding]:
     if is_undecided(alarm):
         text = f"{alarm['text']}, which is not decided: the end of the path is by odometry"
         yield Finding("elsewhere", "error", text=text)
-    if not sum(counts["believed"] or 0 for counts in summary.get("inputs", {}).values()):
+    landmarks, inputs = summary.get("landmarks", 0), summary.get("inputs", {}).values()
+    if not sum(one["believed"] or 0 for one in inputs if landmarks or one["use"] != "landmarks"):
         text = "this is odometry alone: no landmark, fix or closure is in the result"
         yield Finding("odometry_alone", "error", text=text)
     measured = [one for one in summary.get("noise", ()) if one["dof"] >= 1.0]
@@ -324,7 +325,6 @@ def _of_sightings(summary: Summary) -> Iterator[Finding]:
                 "odometry alone"
             )
             yield Finding("noise_too_large", "error", text=text, source=name)
-    landmarks = summary.get("landmarks", 0)
     if landmarks and summary["sightings"] == landmarks:
         yield Finding("not_seen_again", "error", text="no landmark was seen twice, so they correct nothing")
     contested = summary.get("contested", {})

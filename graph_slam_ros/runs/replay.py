@@ -57,16 +57,9 @@ class RecordedRuns:
     If the stamps of odometry begin anew, ``time.on_jump`` decides what happens to the run. Static transforms are read
     first, because they hold for the whole recording.
 
-    Parameters
-    ----------
-    datum : where on earth the map begins: latitude [deg], longitude [deg], height [m]; empty: at the first fix
-    assumed : parameters that were chosen for the recording
-
-    Attributes
-    ----------
-    count : of the messages
-    counters : of what became of them
-    counted : what was counted when each run but the last ended
+    ``datum``: where on earth the map begins (latitude [deg], longitude [deg], height [m]; empty: at the first fix).
+    ``assumed``: parameters that were chosen for the recording. ``counted``: what was counted when each run but the last
+    ended. Raises BagError: a recorded definition is not what we can use.
     """
 
     def __init__(
@@ -249,6 +242,10 @@ def _again(
     config = with_survey(config or own)
     if config.world != own.world:
         raise RunError(f"{run}: world.dimensions is {own.world.dimensions} there")
+    before = {one.name: one.offset_s for one in own.sources}
+    if moved := [one.name for one in config.sources if one.offset_s != before.get(one.name, one.offset_s)]:
+        why = f"{run}: a run keeps the stamps that it accepted, so {moved[0]}.offset_s changes nothing"
+        raise RunError(f"{why}: replay its recording, or set it for the next drive")
     losses = missing(run)
     state = read_start(run)
     warmup(dimensions=config.world.dimensions)

@@ -362,16 +362,18 @@ def suggestion_for_other_types(path: Path, config: Config, odometry: str | None 
     """
     if config.inputs.names != Config().inputs.names:
         return None
-    bag = open_bag(path)
+    bag, usual, chosen = open_bag(path), f"/{default_input('detections').topic}", dict[str, str]()
     try:
-        if any(name not in ("odom", TF, TF_STATIC) for name in choose_inputs(bag, config, odometry).topics):
+        chosen = {**choose_inputs(bag, config, odometry).topics}
+        if chosen.get("detections") == usual or chosen.keys() - {"odom", "detections", TF, TF_STATIC}:
             return None
     except BagError:  # which the replay says
         is_usual = next(one for one in config.sources if one.name == "odom") == default_input("odom")
         if odometry or not is_usual or any(topic.type == ODOMETRY for topic in bag.topics.values()):
             return None
     found = Suggestion(bag, path, odometry)
-    return None if found.trouble or len(found.names) < 2 else found
+    is_same = "detections" in chosen and chosen["detections"] == found.topics.get("detections")
+    return None if found.trouble or len(found.names) < 2 or is_same else found
 
 
 def unused_topics(path: Path, used: Collection[str]) -> list[str]:

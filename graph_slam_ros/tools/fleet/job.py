@@ -76,7 +76,7 @@ def run_job(job: Job) -> Row:
             with _memory_limit(job.memory):
                 try:
                     row |= _results(job, made)
-                except (GraphSlamError, MemoryError, OSError) as error:
+                except (GraphSlamError, MemoryError, SystemError, OSError) as error:
                     row |= {"state": "failed", "reason": _reason(job, error)}
             keep(Path(job.out), job.key, made, row)
         finally:
@@ -106,7 +106,7 @@ def failed(job: Job, reason: str) -> Row:
 
 def _reason(job: Job, error: BaseException) -> str:
     """The reason why a recording cannot be used; an error of the machine is raised instead, also one behind another."""
-    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+    if isinstance(error, MemoryError | SystemError) or getattr(error, "errno", None) == errno.ENOMEM:  # of C code
         return f"out of memory: more than {job.memory / 2**20:.0f} MiB (--memory)"
     cause: BaseException | None = error
     while cause is not None:

@@ -151,7 +151,7 @@ def test_plot_draws_with_and_without_truth_and_replay_always(tmp_path, recording
     assert main(["map", "export", out, "--topic", "/odom", "--out", str(tmp_path / "c.png")]) == 2
     assert main(["map", "export", str(tmp_path / "none"), "--out", str(tmp_path / "c.png")]) == 2
     assert main(["map", "export", out, "--out", str(tmp_path / "c.bmp")]) == 2
-    assert "its ending is none of .tum, .g2o, .mcap, .png" in capsys.readouterr().err
+    assert "its ending is none of .tum, .g2o, .geojson, .mcap, .png" in capsys.readouterr().err
 
 
 def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path, monkeypatch, capsys):
