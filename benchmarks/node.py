@@ -35,7 +35,7 @@ _CITY = {  # a keyframe for each pose, and the noise that the world has
 
 
 def cpu(short: bool) -> list[Row]:
-    """CPU time with odometry at 100 Hz and landmarks at 10 Hz, against a bare node that subscribes to the same."""
+    """CPU time with odometry at 50 Hz and landmarks at 10 Hz, against a bare node that subscribes to the same."""
     seconds, reps = (5.0, 1) if short else (30.0, 3)
     spent: dict[str, list[float]] = {"the node": [], "a bare node": []}
     for _ in range(reps):
@@ -55,7 +55,7 @@ def cpu(short: bool) -> list[Row]:
 
 
 def _cpu_of(who: str, seconds: float) -> float:
-    driven = {"seconds": seconds + 2 * _WARM_S, "odometry_hz": 100, "landmarks_hz": 10}
+    driven = {"seconds": seconds + 2 * _WARM_S, "odometry_hz": 50, "landmarks_hz": 10}
     if who == "a bare node":
         with Process(BARE, ODOMETRY, LANDMARKS) as bare, Robot("warehouse", **driven) as robot:
             return _spent(bare, robot, seconds)
