@@ -79,9 +79,9 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
     if named is None and settings.topic != default_input(settings.name).topic:
         named = usual
     if named is not None:
-        topic = bag.topics.get(named)
-        if topic is None:
-            raise BagError(f"no topic {named} in the recording; {there}{did_you_mean(named, bag.topics)}")
+        if (topic := bag.topics.get(named)) is None:
+            near = did_you_mean(named, [one for one in bag.topics if not is_truth(one)])
+            raise BagError(f"no topic {named} in the recording; {there}{near}")
         if not topic.type:
             raise BagError(f"topic {named} has no type: the recording lacks its schema")
         if topic.type != settings.type:
